@@ -1,0 +1,1 @@
+"""A JAX-native, vectorised, end-to-end trainer for APT-Gen."""

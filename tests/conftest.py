@@ -1,0 +1,62 @@
+"""Strict JAX for every test, on two host devices.
+
+* two CPU devices in each process, so that sharding is exercised for real;
+* a key used twice is an error (`jax_debug_key_reuse`);
+* mixing dtypes or ranks implicitly is an error (strict promotion).
+
+The settings are global rather than per test, so that module-scoped fixtures compile under them too.  A test that has to
+break one says so with `@pytest.mark.relaxed("dtype")` (any of "dtype", "rank", "keys"), and why.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack
+from typing import Any
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import hypothesis
+import jax
+import optax
+import pytest
+
+jax.config.update("jax_num_cpu_devices", 2)
+jax.config.update("jax_debug_key_reuse", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Compilation makes the first example slow, and a run must not depend on what an earlier one stored.
+hypothesis.settings.register_profile("strict", deadline=None, derandomize=True, database=None, max_examples=30)
+hypothesis.settings.load_profile("strict")
+
+RELAXATIONS: dict[str, Callable[[], AbstractContextManager[Any]]] = {
+    "dtype": lambda: jax.numpy_dtype_promotion("standard"),
+    "rank": lambda: jax.numpy_rank_promotion("allow"),
+    "keys": lambda: jax.debug_key_reuse(False),
+}
+
+
+def _standard_promotion(function: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def relaxed(*args: Any, **kwargs: Any) -> Any:
+        with jax.numpy_dtype_promotion("standard"):
+            return function(*args, **kwargs)
+
+    return relaxed
+
+
+# Adam's bias correction raises a float to an int32 power, the one place in optax that strict promotion stops.
+optax.tree.bias_correction = _standard_promotion(optax.tree.bias_correction)
+
+
+@pytest.fixture(autouse=True)
+def _relaxed(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Loosens what the test's `relaxed` markers name."""
+    with ExitStack() as stack:
+        for marker in request.node.iter_markers("relaxed"):
+            for name in marker.args:
+                stack.enter_context(RELAXATIONS[name]())
+        yield
