@@ -1,0 +1,61 @@
+"""The protocol every task space fulfils; the trainer knows task spaces through it alone."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from apt_jax.specs import Obs, Params, Spec
+
+
+class StepOutput(NamedTuple):
+    """What one environment step returns; no field is batched.
+
+    `obs` is the true observation after the step, also at an episode's end: the caller resets.  `terminated` (the MDP ended, no
+    bootstrap) and `truncated` (the horizon was reached, bootstrap) are never both true.
+    """
+
+    state: Any
+    obs: Obs
+    reward: Float[Array, ""]
+    terminated: Bool[Array, ""]
+    truncated: Bool[Array, ""]
+    success: Bool[Array, ""]
+
+
+class TaskSpace(Protocol):
+    """A parameterised family of tasks sharing observations, actions and horizon (paper, Sec. 3.1).
+
+    `w` (learned parameters, described by `param_spec`) and `task` (a concrete MDP, any pytree of arrays) are different types,
+    because a target may lie outside the space: a target is a task.  All methods are pure, jittable and unbatched.
+    """
+
+    name: str
+    obs_spec: Spec
+    param_spec: Spec
+    num_actions: int
+    horizon: int
+
+    def sample_uniform(self, key: Key[Array, ""]) -> Params:
+        """A task parameter drawn uniformly; consumes `key`."""
+        ...
+
+    def instantiate(self, w: Params) -> Any:
+        """The black-box procedural generation module M(w): the task of a parameter."""
+        ...
+
+    def reset(self, key: Key[Array, ""], task: Any) -> tuple[Any, Obs]:
+        """An initial state of a task and its observation; consumes `key`."""
+        ...
+
+    def step(self, state: Any, action: Int[Array, ""], task: Any) -> StepOutput:
+        """One step with an action in [0, num_actions)."""
+        ...
+
+    def describe(self, task: Any) -> dict[str, Float[Array, ""]]:
+        """Scalars worth watching as a curriculum unfolds; the space chooses names (e.g. `feasible`, `solution_length`).
+
+        NaN says "not defined for this task"; means over tasks skip it.
+        """
+        ...

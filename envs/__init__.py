@@ -1,0 +1,77 @@
+"""Task spaces in pure JAX, by name, with their target tasks.
+
+A new space is a package with a class that fulfils `BenchmarkSpace`, and one entry in `SPACES`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from difflib import SequenceMatcher
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from jaxtyping import UInt8
+
+from apt_jax.task_space import TaskSpace
+from envs import grid_world
+
+T = TypeVar("T")
+
+
+class BenchmarkSpace(TaskSpace, Protocol):
+    """A task space that comes with target tasks and pictures.
+
+    Attributes:
+      targets: text of each target task by name, for `parse_target`.
+    """
+
+    targets: Mapping[str, str]
+
+    def parse_target(self, text: str) -> Any:
+        """The task that `text` describes; raises ValueError saying where the text is wrong."""
+        ...
+
+    def render(self, task: Any, state: Any = None, tile_size: int = 32) -> UInt8[np.ndarray, "height width 3"]:
+        """RGB picture of a task in `state`, or as it starts; runs on the host."""
+        ...
+
+
+SPACES: Mapping[str, Callable[[], BenchmarkSpace]] = {
+    "grid_world": grid_world.Space,
+}
+"""Constructor of each task space by name."""
+
+
+def make(name: str) -> BenchmarkSpace:
+    """The task space called `name`; raises ValueError on a wrong name."""
+    return _lookup(SPACES, name, "task space")()
+
+
+def load_target(space_name: str, target: str) -> Any:
+    """The target task called `target` (such as "A") of a space; raises ValueError on a wrong name."""
+    space = make(space_name)
+    return space.parse_target(_lookup(space.targets, target, f"target of {space_name}"))
+
+
+def load_target_file(space_name: str, path: str | Path) -> Any:
+    """The target task described in a user's text file.
+
+    Raises:
+      ValueError: on a wrong name, or with the file's name and the place of a mistake in it.
+      OSError: if the file cannot be read.
+    """
+    space = make(space_name)
+    text = Path(path).read_text(encoding="utf-8")
+    try:
+        return space.parse_target(text)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _lookup(table: Mapping[str, T], name: str, kind: str) -> T:
+    """`table[name]`, or a ValueError that names the closest entry and all others."""
+    if name in table:
+        return table[name]
+    closest = max(table, key=lambda entry: SequenceMatcher(None, name.casefold(), entry.casefold()).ratio())
+    raise ValueError(f"unknown {kind} {name!r}; closest is {closest!r}, allowed are {', '.join(sorted(table))}")
