@@ -1,0 +1,17 @@
+"""The paper's networks, built from specs (appendix "Network Architectures")."""
+
+from apt_jax.networks.discriminator import Discriminator, pool
+from apt_jax.networks.generator import Generator
+from apt_jax.networks.q_network import QNetwork
+from apt_jax.networks.spectral import init_singular_vectors, spectral_normalize
+from apt_jax.networks.value_network import ValueNetwork
+
+__all__ = [
+    "Discriminator",
+    "Generator",
+    "QNetwork",
+    "ValueNetwork",
+    "init_singular_vectors",
+    "pool",
+    "spectral_normalize",
+]

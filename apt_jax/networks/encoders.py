@@ -1,0 +1,72 @@
+"""Encoders of observations and task parameters, built from their spec (paper, appendix "Network Architectures")."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from apt_jax.networks.layers import Conv
+from apt_jax.specs import Grid, Obs, Params, Spec, Vector
+
+ENCODING_SIZE = 64
+CHANNELS = 16
+MERGE_SIZE = 128
+
+Features: TypeAlias = dict[str, Float[Array, "..."]]
+"""Per modality: a Vector's numbers in [-1, 1], shape [..., size]; a Grid's channels, shape [..., h, w, categories]."""
+
+
+def observation_features(spec: Spec, obs: Obs) -> Features:
+    """What the networks see of an observation: vectors over their scale, grids one-hot."""
+    features = {}
+    for name, modality in spec.items():
+        match modality:
+            case Vector():
+                features[name] = obs[name].astype(jnp.float32) / modality.scale
+            case Grid():
+                features[name] = jax.nn.one_hot(obs[name], modality.categories)
+    return features
+
+
+def parameter_features(spec: Spec, w: Params) -> Features:
+    """What the networks see of a task parameter: vectors over their scale, grid scores as they are."""
+    return {name: w[name] / block.scale if isinstance(block, Vector) else w[name] for name, block in spec.items()}
+
+
+class GridStack(nn.Module):
+    """Two convolutions of stride 2, flattened: [..., h, w, c] -> [..., ceil(h/4) * ceil(w/4) * 16]."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch h w c"]) -> Float[Array, "*batch flat"]:
+        for _ in range(2):
+            x = nn.relu(Conv(CHANNELS, stride=2)(x))
+        return x.reshape(*x.shape[:-3], -1)
+
+
+class Encoder(nn.Module):
+    """One 64-dimensional encoding per modality, side by side: features -> [..., 64 * len(spec)]."""
+
+    spec: Spec
+
+    @nn.compact
+    def __call__(self, features: Features) -> Float[Array, "*batch encoding"]:
+        encodings = []
+        for name, modality in self.spec.items():
+            x = GridStack(name=f"{name}_stack")(features[name]) if isinstance(modality, Grid) else features[name]
+            encodings.append(nn.relu(nn.Dense(ENCODING_SIZE, name=name)(x)))
+        return jnp.concatenate(encodings, axis=-1)
+
+
+class Head(nn.Module):
+    """Merges encodings by a 128-dimensional layer and predicts: [..., encoding] -> [..., outputs]."""
+
+    outputs: int
+
+    @nn.compact
+    def __call__(self, encoding: Float[Array, "*batch encoding"]) -> Float[Array, "*batch outputs"]:
+        hidden = nn.relu(nn.Dense(MERGE_SIZE, name="merge")(encoding))
+        return nn.Dense(self.outputs, name="output")(hidden)

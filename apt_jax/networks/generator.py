@@ -1,0 +1,76 @@
+"""Task parameters from noise (paper, appendix "Task Generator")."""
+
+from __future__ import annotations
+
+from functools import partial
+from math import prod
+
+import flax.linen as nn
+from jaxtyping import Array, Float
+
+from apt_jax.networks.encoders import CHANNELS, ENCODING_SIZE
+from apt_jax.networks.layers import Conv, ConvTranspose
+from apt_jax.specs import Grid, Params, Spec, Vector
+
+
+class Generator(nn.Module):
+    """z [batch, noise_size] -> w, each modality [batch, ...].
+
+    "Batch normalization is used in all layers", here also in the output layers.  With `train=True` the statistics are those
+    of the batch, so the batch must be an axis of `z` (a `vmap` over samples would make all outputs equal), hold more than one
+    sample, and `batch_stats` must be mutable.  With `train=False` they are the running ones.
+
+    Attributes:
+      param_spec: the task parameter's modalities.
+      momentum: of the running statistics.  0.9 averages about 20 batches and lags 10 updates behind the weights; the lag of
+        0.99, 100 updates, costs more than its steadier average gains.
+    """
+
+    param_spec: Spec
+    momentum: float = 0.9
+
+    @nn.compact
+    def __call__(self, z: Float[Array, "batch noise"], *, train: bool) -> Params:
+        norm = partial(nn.BatchNorm, use_running_average=not train, momentum=self.momentum)
+        hidden = nn.Dense(ENCODING_SIZE, use_bias=False, name="noise")(z)
+        hidden = nn.relu(norm(name="noise_norm")(hidden))
+        w = {}
+        for name, modality in self.param_spec.items():
+            match modality:
+                case Vector():
+                    w[name] = VectorHead(modality, norm, name=name)(hidden)
+                case Grid():
+                    w[name] = GridHead(modality, norm, name=name)(hidden)
+        return w
+
+
+class VectorHead(nn.Module):
+    """A sigmoid stretched over the modality's range: [batch, hidden] -> [batch, size]."""
+
+    vector: Vector
+    norm: partial[nn.BatchNorm]
+
+    @nn.compact
+    def __call__(self, hidden: Float[Array, "batch hidden"]) -> Float[Array, "batch size"]:
+        logits = self.norm()(nn.Dense(self.vector.size, use_bias=False)(hidden))
+        return self.vector.low + (self.vector.high - self.vector.low) * nn.sigmoid(logits)
+
+
+class GridHead(nn.Module):
+    """Two transposed convolutions from a quarter of the board, a convolution, a softmax: [batch, hidden] -> [batch, h, w, c].
+
+    Boards whose sides are no multiple of four are cut out of the next larger one.
+    """
+
+    grid: Grid
+    norm: partial[nn.BatchNorm]
+
+    @nn.compact
+    def __call__(self, hidden: Float[Array, "batch hidden"]) -> Float[Array, "batch h w c"]:
+        shape = (-(-self.grid.height // 4), -(-self.grid.width // 4), CHANNELS)
+        x = nn.relu(self.norm()(nn.Dense(prod(shape), use_bias=False)(hidden))).reshape(-1, *shape)
+        for _ in range(2):
+            x = nn.relu(self.norm()(ConvTranspose(CHANNELS)(x)))
+        x = x[:, : self.grid.height, : self.grid.width]
+        x = self.norm()(Conv(self.grid.categories, use_bias=False)(x))
+        return nn.softmax(x)
