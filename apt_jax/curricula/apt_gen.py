@@ -1,0 +1,212 @@
+"""APT-Gen: a generator trained through a progress value and a return value (paper, Algorithm 1)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, Key
+
+from apt_jax import replay as rp
+from apt_jax.config import Config, HParams
+from apt_jax.curricula.base import GENERATED, TARGET, Curriculum, Metrics
+from apt_jax.losses import adapt_beta, discriminator_loss, generator_objective
+from apt_jax.networks import Discriminator, Generator, ValueNetwork, init_singular_vectors, pool, spectral_normalize
+from apt_jax.networks.apply import apply
+from apt_jax.specs import Grid, Params, Spec, obs_struct, param_struct, zeros_like
+from apt_jax.task_space import TaskSpace
+
+
+class Models(NamedTuple):
+    """Parameters of everything that one Adam trains: theta_g, theta_d, theta_1, theta_2 of the paper."""
+
+    generator: Any
+    discriminator: Any
+    progress_value: Any
+    return_value: Any
+
+
+class AptGenState(NamedTuple):
+    """Models, their optimiser, the generator's BatchNorm statistics, the power iteration's vectors, and beta."""
+
+    models: Models
+    opt_state: Any
+    batch_stats: Any
+    spectral: Any
+    beta: Float[Array, ""]
+
+
+_ADAM = optax.flatten(optax.scale_by_adam())
+
+
+def as_instantiated(spec: Spec, w: Params) -> Params:
+    """Replace category scores by the one-hot of their argmax, with the gradient of the scores (straight-through).
+
+    A task shows nothing of its scores but their argmax, so this is what the value networks are to see.
+    """
+
+    def harden(name: str) -> Array:
+        scores = w[name]
+        if not isinstance(spec[name], Grid):
+            return scores
+        one_hot = jax.nn.one_hot(jnp.argmax(scores, axis=-1), scores.shape[-1])
+        return scores + jax.lax.stop_gradient(one_hot - scores)
+
+    return {name: harden(name) for name in w}
+
+
+def apt_gen(space: TaskSpace, config: Config) -> Curriculum:
+    """The paper's curriculum."""
+    generator = Generator(space.param_spec)
+    discriminator = Discriminator(space.obs_spec, space.num_actions)
+    value = ValueNetwork(space.param_spec)
+    recent = config.recent_steps // config.envs_per_source
+
+    def noise(key: Key[Array, ""], n: int) -> Float[Array, "n z"]:
+        return jax.random.normal(key, (n, config.noise_size))
+
+    def generate(params: Any, batch_stats: Any, z: Float[Array, "n z"]) -> tuple[Params, Any]:
+        """Tasks under the batch's own statistics, and the running statistics moved towards them."""
+        variables = {"params": params, "batch_stats": batch_stats}
+        w, updated = apply(generator, variables, z, train=True, mutable=["batch_stats"])
+        return w, updated["batch_stats"]
+
+    def score(params: Any, rollouts: rp.Rollouts) -> Float[Array, "B"]:
+        """The discriminator's pooled logit of each rollout."""
+        steps = rollouts.steps
+        initial = apply(discriminator, params, rollouts.initial_obs, method="score_init")
+        transitions = apply(
+            discriminator, params, steps.obs, steps.action, reward=steps.reward, next_obs=steps.next_obs, method="score_step"
+        )
+        return pool(initial, transitions, rollouts.length)
+
+    def evaluate(params: Any, w: Params) -> Float[Array, "..."]:
+        return apply(value, params, as_instantiated(space.param_spec, w))
+
+    def init(key: Key[Array, ""], hparams: HParams) -> AptGenState:
+        key_g, key_d, key_1, key_2, key_spectral, key_stats = jax.random.split(key, 6)
+        variables = generator.init(key_g, jnp.zeros((2, config.noise_size)), train=True)
+        w = zeros_like(param_struct(space.param_spec))
+        obs = zeros_like(obs_struct(space.obs_spec))
+        models = Models(
+            generator=variables["params"],
+            discriminator=discriminator.init(key_d, obs, jnp.int32(0), reward=jnp.float32(0.0), next_obs=obs),
+            progress_value=value.init(key_1, w),
+            return_value=value.init(key_2, w),
+        )
+
+        # The first tasks are drawn from running statistics, which must describe the fresh generator before it is used.
+        def settle(stats: Any, key: Key[Array, ""]) -> tuple[Any, None]:
+            return generate(models.generator, stats, noise(key, config.model_batch_size))[1], None
+
+        batch_stats, _ = jax.lax.scan(settle, variables["batch_stats"], jax.random.split(key_stats, 100))
+        return AptGenState(
+            models=models,
+            opt_state=_ADAM.init(models),
+            batch_stats=batch_stats,
+            spectral=init_singular_vectors(key_spectral, models.discriminator),
+            beta=jnp.asarray(hparams.beta_init, jnp.float32),
+        )
+
+    def propose(state: AptGenState, key: Key[Array, ""], n: int) -> Params:
+        variables = {"params": state.models.generator, "batch_stats": state.batch_stats}
+        return apply(generator, variables, noise(key, n), train=False)
+
+    def update(
+        state: AptGenState, key: Key[Array, ""], replay: rp.Replay, iteration: Int[Array, ""], hparams: HParams
+    ) -> tuple[AptGenState, Metrics]:
+        key_target, key_generated, key_z = jax.random.split(key, 3)
+
+        def sample(key: Key[Array, ""], source: int) -> rp.Rollouts:
+            return rp.sample_rollouts(
+                replay,
+                key,
+                iteration,
+                source=source,
+                batch_size=config.model_batch_size,
+                steps=config.rollout_steps,
+                recent=recent,
+            )
+
+        target, generated = sample(key_target, TARGET), sample(key_generated, GENERATED)
+        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), target, generated)
+        z = noise(key_z, config.model_batch_size)
+
+        def loss(models: Models) -> tuple[Float[Array, ""], tuple[Any, Any, Metrics]]:
+            """All four objectives: each parameter group receives the gradient of its own alone."""
+            params, spectral = spectral_normalize(models.discriminator, state.spectral, bound=hparams.spectral_bound)
+            target_logit, generated_logit = jnp.split(score(params, both), 2)
+            loss_d = discriminator_loss(target_logit, generated_logit)
+
+            progress = jax.lax.stop_gradient(progress_score(generated_logit, config.progress))
+            progress_error = evaluate(models.progress_value, generated.w) - progress
+            return_error = evaluate(models.return_value, generated.w) - generated.episode_return
+
+            w, batch_stats = generate(models.generator, state.batch_stats, z)
+            frozen = jax.lax.stop_gradient(models)
+            progress_value, return_value = evaluate(frozen.progress_value, w), evaluate(frozen.return_value, w)
+            objective = generator_objective(progress_value, return_value, beta=state.beta, delta=hparams.delta)
+            metrics = {
+                "discriminator_loss": loss_d,
+                "discriminator_target_logit": jnp.mean(target_logit),
+                "discriminator_generated_logit": jnp.mean(generated_logit),
+                "discriminator_generated_spread": jnp.std(generated_logit),
+                "discriminator_accuracy": 0.5
+                * (jnp.mean(jnp.float32(target_logit > 0.0)) + jnp.mean(jnp.float32(generated_logit < 0.0))),
+                "v1_unexplained": jnp.mean(progress_error**2) / (jnp.var(progress) + 1e-6),
+                "v2_unexplained": jnp.mean(return_error**2) / (jnp.var(generated.episode_return) + 1e-6),
+                "generator_progress": jnp.mean(progress_value),
+                "generator_return": jnp.mean(return_value),
+            }
+            total = loss_d + jnp.mean(progress_error**2) + jnp.mean(return_error**2) - objective
+            return total, (batch_stats, spectral, metrics)
+
+        grads, (batch_stats, spectral, metrics) = jax.grad(loss, has_aux=True)(state.models)
+        direction, opt_state = _ADAM.update(grads, state.opt_state)
+        rates = Models(
+            generator=hparams.generator_learning_rate,
+            discriminator=hparams.discriminator_learning_rate,
+            progress_value=hparams.value_learning_rate,
+            return_value=hparams.value_learning_rate,
+        )
+        models = Models(*map(_descend, state.models, direction, rates))
+        return AptGenState(models, opt_state, batch_stats, spectral, state.beta), metrics
+
+    def refresh(state: AptGenState, replay: rp.Replay, hparams: HParams) -> AptGenState:
+        outcome = rp.recent_outcome(replay, source=GENERATED, window=config.return_window)
+        beta = adapt_beta(
+            state.beta,
+            outcome["episode_return"],
+            delta=hparams.delta,
+            tolerance=hparams.tolerance,
+            low=hparams.beta_min,
+            high=hparams.beta_max,
+        )
+        return state._replace(beta=beta)
+
+    def report(state: AptGenState, w: Params, episode_return: Float[Array, "n"]) -> Metrics:
+        predicted = evaluate(state.models.return_value, w)
+        return {
+            "beta": state.beta,
+            "v2_correlation": correlation(predicted, episode_return),
+            "v2_bias": jnp.mean(predicted - episode_return),
+        }
+
+    return Curriculum(True, init, propose, update, refresh, report)
+
+
+def _descend(params: Any, direction: Any, rate: Float[Array, ""] | float) -> Any:
+    return jax.tree.map(lambda p, d: p - rate * d, params, direction)
+
+
+def progress_score(logit: Float[Array, "B"], form: str) -> Float[Array, "B"]:
+    """The task progress eta that V1 learns: the discriminator's "probability" (the paper's form) or its "logit"."""
+    return jax.nn.sigmoid(logit) if form == "probability" else logit
+
+
+def correlation(a: Float[Array, "n"], b: Float[Array, "n"]) -> Float[Array, ""]:
+    """Pearson correlation, 0 where either side is constant."""
+    a, b = a - jnp.mean(a), b - jnp.mean(b)
+    return jnp.sum(a * b) / (jnp.sqrt(jnp.sum(a**2) * jnp.sum(b**2)) + 1e-6)

@@ -1,0 +1,82 @@
+"""The interface of a curriculum: which tasks to generate next, and how to learn that from experience."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+from jaxtyping import Array, Float, Int, Key
+
+from apt_jax.config import HParams
+from apt_jax.replay import Replay
+from apt_jax.specs import Params
+
+TARGET, GENERATED = 0, 1
+"""Indices of the sources along the leading axis of replay and workers."""
+
+Metrics = dict[str, Float[Array, ""]]
+
+
+class InitFn(Protocol):
+    """`init(key, hparams) -> state`: a pytree of arrays; consumes `key`."""
+
+    def __call__(self, key: Key[Array, ""], hparams: HParams) -> Any: ...
+
+
+class ProposeFn(Protocol):
+    """`propose(state, key, n) -> w`: `n` task parameters, leaves [n, ...]; consumes `key`."""
+
+    def __call__(self, state: Any, key: Key[Array, ""], n: int) -> Params: ...
+
+
+class UpdateFn(Protocol):
+    """`update(state, key, replay, iteration, hparams) -> (state, metrics)`: one round of learning; consumes `key`."""
+
+    def __call__(
+        self, state: Any, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
+    ) -> tuple[Any, Metrics]: ...
+
+
+class RefreshFn(Protocol):
+    """`refresh(state, replay, hparams) -> state`: slow adaptation on the cadence `Config.refresh_every`."""
+
+    def __call__(self, state: Any, replay: Replay, hparams: HParams) -> Any: ...
+
+
+class ReportFn(Protocol):
+    """`report(state, w, episode_return) -> metrics`: judge the state on fresh tasks (leaves [n, ...]) and their returns [n]."""
+
+    def __call__(self, state: Any, w: Params, episode_return: Float[Array, "n"]) -> Metrics: ...
+
+
+class Curriculum(NamedTuple):
+    """A plug-in made of pure functions over an explicit state; unbatched over seeds.
+
+    `generates` is False for the null plug-in, which has no generated source: its `propose` is never called.
+    """
+
+    generates: bool
+    init: InitFn
+    propose: ProposeFn
+    update: UpdateFn
+    refresh: RefreshFn
+    report: ReportFn
+
+
+def no_update(
+    state: Any, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
+) -> tuple[Any, Metrics]:
+    """The `update` of a curriculum that does not learn."""
+    del key, replay, iteration, hparams
+    return state, {}
+
+
+def no_refresh(state: Any, replay: Replay, hparams: HParams) -> Any:
+    """The `refresh` of a curriculum that does not adapt."""
+    del replay, hparams
+    return state
+
+
+def no_report(state: Any, w: Params, episode_return: Float[Array, "n"]) -> Metrics:
+    """The `report` of a curriculum that has no model of tasks."""
+    del state, w, episode_return
+    return {}

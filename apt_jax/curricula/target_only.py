@@ -1,0 +1,26 @@
+"""No curriculum: the policy learns on the target alone (plain DQN)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from jaxtyping import Array, Key
+
+from apt_jax.config import Config, HParams
+from apt_jax.curricula.base import Curriculum, no_refresh, no_report, no_update
+from apt_jax.specs import Params
+from apt_jax.task_space import TaskSpace
+
+
+def target_only(space: TaskSpace, config: Config) -> Curriculum:
+    """The null plug-in: there is no generated source."""
+    del space, config
+
+    def init(key: Key[Array, ""], hparams: HParams) -> Any:
+        del key, hparams
+        return ()
+
+    def propose(state: Any, key: Key[Array, ""], n: int) -> Params:
+        raise ValueError("target_only generates no tasks")
+
+    return Curriculum(False, init, propose, no_update, no_refresh, no_report)

@@ -1,0 +1,125 @@
+"""Many seeds and hyper-parameters as lanes of one compiled program.
+
+A lane is one (key, HParams).  The functions of `apt_jax.trainer` know nothing of lanes; here they are batched, sharded over
+devices and jitted.  Within a device, lanes run side by side ("vmap", best on accelerators) or one after another ("map", best
+on CPU, where batched small matmuls cost more than the same matmuls in turn: see BENCHMARKS.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Key
+
+from apt_jax.config import HParams
+from apt_jax.curricula.base import Metrics
+from apt_jax.trainer import Clock, Trainer, TrainState
+
+Layout = Literal["auto", "vmap", "map"]
+
+
+class Program(NamedTuple):
+    """A trainer over L lanes, jitted; states are donated: after a call only the returned one is valid.
+
+    States hold at least L lanes (padded to a multiple of the devices by repeating the last); metrics hold exactly L.
+
+    Attributes:
+      init: `init(keys, hparams) -> states`, for keys [L] and hparams with leaves [L].
+      warmup: `warmup(states, clock, hparams) -> (states, clock)`.
+      chunk: `chunk(states, clock, hparams) -> (states, clock, metrics)`, metrics with leaves [L].
+    """
+
+    init: Callable[[Key[Array, "L"], HParams], TrainState]
+    warmup: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock]]
+    chunk: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock, Metrics]]
+
+
+def stack_hparams(hparams: Sequence[HParams]) -> HParams:
+    """HParams of single lanes as one with leaves float32 [L]."""
+    return jax.tree.map(lambda *leaves: np.asarray(leaves, np.float32), *hparams)
+
+
+def make_program(
+    trainer: Trainer, lanes: int, *, layout: Layout = "auto", devices: Sequence[jax.Device] | None = None
+) -> Program:
+    """Batch a trainer over `lanes`.
+
+    Args:
+      layout: how the lanes of one device are laid out; "auto" is "map" on CPU and "vmap" elsewhere.
+      devices: what to shard lanes over, by default every device; no more are used than there are lanes.
+
+    Raises:
+      ValueError: fewer than one lane.
+    """
+    if lanes < 1:
+        raise ValueError(f"A program needs at least one lane, got {lanes}")
+    used = list(devices or jax.devices())[:lanes]
+    if layout == "auto":
+        layout = "map" if used[0].platform == "cpu" else "vmap"
+    mesh = Mesh(np.array(used), ("lane",))
+    lane, shared = PartitionSpec("lane"), PartitionSpec()
+    padding = -lanes % len(used)
+
+    def pad(tree: Any) -> Any:
+        return jax.tree.map(lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], padding, axis=0)]), tree) if padding else tree
+
+    def over_lanes(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
+        batched = _vmap(function, in_specs, out_specs) if layout == "vmap" else _map(function, in_specs, out_specs)
+        return jax.shard_map(batched, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
+
+    init = over_lanes(trainer.init, (lane, lane), lane)
+    warmup = over_lanes(trainer.warmup, (lane, shared, lane), (lane, shared))
+    chunk = over_lanes(trainer.chunk, (lane, shared, lane), (lane, shared, lane))
+
+    @jax.jit
+    def init_all(keys: Key[Array, "L"], hparams: HParams) -> TrainState:
+        return init(pad(keys), pad(hparams))
+
+    @partial(jax.jit, donate_argnums=0)
+    def warmup_all(states: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock]:
+        return warmup(states, clock, pad(hparams))
+
+    @partial(jax.jit, donate_argnums=0)
+    def chunk_all(states: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock, Metrics]:
+        states, clock, metrics = chunk(states, clock, pad(hparams))
+        return states, clock, jax.tree.map(lambda x: x[:lanes], metrics)
+
+    return Program(init_all, warmup_all, chunk_all)
+
+
+def _axes(specs: Any) -> Any:
+    """`vmap` axes of partition specs: 0 for what has lanes, None for what is shared."""
+    return jax.tree.map(
+        lambda spec: 0 if spec == PartitionSpec("lane") else None, specs, is_leaf=lambda x: isinstance(x, PartitionSpec)
+    )
+
+
+def _vmap(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
+    return jax.vmap(function, in_axes=_axes(in_specs), out_axes=_axes(out_specs))
+
+
+def _map(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
+    """Like `_vmap`, one lane after another."""
+    batched = [axis == 0 for axis in _axes(in_specs)]
+
+    def mapped(*args: Any) -> Any:
+        def one(lane_args: list[Any]) -> Any:
+            rest = iter(lane_args)
+            return function(*(next(rest) if b else arg for b, arg in zip(batched, args, strict=True)))
+
+        out = jax.lax.map(one, [arg for b, arg in zip(batched, args, strict=True) if b])
+        if not isinstance(out_specs, tuple):
+            return out
+        # What is shared came out once per lane, all alike.
+        return tuple(
+            value if axis == 0 else jax.tree.map(lambda x: x[0], value)
+            for value, axis in zip(out, _axes(out_specs), strict=True)
+        )
+
+    return mapped

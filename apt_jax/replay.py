@@ -1,0 +1,246 @@
+"""What was experienced: a ring of transitions per environment and a ring of finished episodes per source.
+
+All sources write one column of the transition ring per iteration, at the same unbatched position, so that a write is one
+in-place `dynamic_update_slice` and an episode lies contiguously (modulo the capacity) in its environment's row.
+
+Axes: S sources, E environments per source, T columns, N episode slots.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from apt_jax.specs import Obs, Params, Spec, obs_struct, param_struct, zeros_like
+
+
+class Transition(NamedTuple):
+    """One environment step.  `next_obs` is the true observation after it, also where an episode ended.
+
+    `done` is terminated or truncated: the next column belongs to another episode.
+    """
+
+    obs: Obs
+    action: Int[Array, "..."]
+    reward: Float[Array, "..."]
+    next_obs: Obs
+    terminated: Bool[Array, "..."]
+    done: Bool[Array, "..."]
+
+
+class Batch(NamedTuple):
+    """Transitions over n steps to learn from, leaves [..., B, ...].
+
+    `reward` is the discounted sum of the rewards on the way; `discount` multiplies the value of `next_obs`: gamma to the number
+    of steps made, 0 after a termination.
+    """
+
+    obs: Obs
+    action: Int[Array, "..."]
+    reward: Float[Array, "..."]
+    next_obs: Obs
+    discount: Float[Array, "..."]
+
+
+class Episode(NamedTuple):
+    """A finished episode: its task parameter, where its steps lie in the transition ring, and its outcome."""
+
+    w: Params
+    env: Int[Array, "..."]
+    end: Int[Array, "..."]
+    length: Int[Array, "..."]
+    episode_return: Float[Array, "..."]
+    success: Bool[Array, "..."]
+
+
+class Replay(NamedTuple):
+    """Both rings of every source and the range of episodic returns seen so far.
+
+    Attributes:
+      transitions: leaves [S, E, T, ...]; column `i % T` holds iteration i.
+      episodes: leaves [S, N, ...]; slot `i % N` holds the i-th finished episode of the source.
+      finished: episodes finished so far, [S].
+      return_low: smallest undiscounted return of a finished episode of any source, +inf before the first.
+      return_high: largest such return, -inf before the first.
+    """
+
+    transitions: Transition
+    episodes: Episode
+    finished: Int[Array, "S"]
+    return_low: Float[Array, ""]
+    return_high: Float[Array, ""]
+
+
+class Rollouts(NamedTuple):
+    """Sampled episodes of one source, each with its first observation and K of its steps; leaves [B, ...], [B, K, ...]."""
+
+    w: Params
+    initial_obs: Obs
+    steps: Transition
+    length: Int[Array, "B"]
+    episode_return: Float[Array, "B"]
+
+
+def init(obs_spec: Spec, param_spec: Spec, *, sources: int, envs: int, columns: int, episodes: int) -> Replay:
+    """An empty replay."""
+    obs = zeros_like(obs_struct(obs_spec), (sources, envs, columns))
+    step = (sources, envs, columns)
+    slot = (sources, episodes)
+    return Replay(
+        transitions=Transition(
+            obs=obs,
+            action=jnp.zeros(step, jnp.uint8),
+            reward=jnp.zeros(step, jnp.float32),
+            next_obs=jax.tree.map(jnp.copy, obs),
+            terminated=jnp.zeros(step, bool),
+            done=jnp.zeros(step, bool),
+        ),
+        episodes=Episode(
+            w=zeros_like(param_struct(param_spec), slot),
+            env=jnp.zeros(slot, jnp.int32),
+            end=jnp.full(slot, jnp.iinfo(jnp.int32).min, jnp.int32),
+            length=jnp.ones(slot, jnp.int32),
+            episode_return=jnp.zeros(slot, jnp.float32),
+            success=jnp.zeros(slot, bool),
+        ),
+        finished=jnp.zeros(sources, jnp.int32),
+        return_low=jnp.float32(jnp.inf),
+        return_high=jnp.float32(-jnp.inf),
+    )
+
+
+def write(
+    replay: Replay, iteration: Int[Array, ""], transition: Transition, episode: Episode, done: Bool[Array, "S E"]
+) -> Replay:
+    """Write one transition of every environment and the episodes that `done` marks; leaves [S, E, ...]."""
+    columns = replay.transitions.action.shape[2]
+    slots = replay.episodes.env.shape[1]
+    position = iteration % columns
+
+    def put_column(ring: Array, value: Array) -> Array:
+        return jax.lax.dynamic_update_slice_in_dim(ring, value[:, :, None].astype(ring.dtype), position, axis=2)
+
+    # An unfinished episode is scattered out of bounds, where "drop" discards it: a branch or a mask would copy the ring.
+    order = jnp.cumsum(done, axis=1, dtype=jnp.int32) - 1
+    slot = jnp.where(done, (replay.finished[:, None] + order) % slots, slots)
+    source = jnp.arange(done.shape[0], dtype=jnp.int32)[:, None]
+    returns = episode.episode_return
+    return Replay(
+        transitions=jax.tree.map(put_column, replay.transitions, transition),
+        episodes=jax.tree.map(lambda ring, value: ring.at[source, slot].set(value, mode="drop"), replay.episodes, episode),
+        finished=replay.finished + jnp.sum(done, axis=1, dtype=jnp.int32),
+        return_low=jnp.minimum(replay.return_low, jnp.min(returns, initial=jnp.inf, where=done)),
+        return_high=jnp.maximum(replay.return_high, jnp.max(returns, initial=-jnp.inf, where=done)),
+    )
+
+
+def return_range(replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Smallest and largest episodic return seen in any source; unbounded before the first finished episode."""
+    none = replay.return_low > replay.return_high
+    return jnp.where(none, -jnp.inf, replay.return_low), jnp.where(none, jnp.inf, replay.return_high)
+
+
+def sample_transitions(
+    replay: Replay,
+    key: Key[Array, ""],
+    iteration: Int[Array, ""],
+    *,
+    batches: int,
+    batch_size: int,
+    n_step: int,
+    gamma: Float[Array, ""] | float,
+) -> Batch:
+    """`batches` of `batch_size` n-step transitions, uniformly and in equal shares from the sources; consumes `key`.
+
+    A transition stops early where its episode ends and at the latest step written: it then spans fewer than `n_step` steps.
+
+    Args:
+      iteration: the latest iteration written.
+
+    Returns:
+      Leaves [batches, batch_size, ...].
+    """
+    sources, envs, columns = replay.transitions.action.shape
+    share = batch_size // sources
+    key_env, key_age = jax.random.split(key)
+    shape = (sources, batches, share)
+    env = jax.random.randint(key_env, shape, 0, envs)
+    age = jax.random.randint(key_age, shape, 0, jnp.minimum(iteration + 1, columns))
+    row = (jnp.arange(sources, dtype=jnp.int32)[:, None, None] * envs + env) * columns
+    first = iteration - age
+
+    # One flat index over sources, environments and columns: a single leading index is the cheapest gather on every backend.
+    def gather(ring: Array, at: Int[Array, "S batches share"]) -> Array:
+        return ring.reshape(sources * envs * columns, *ring.shape[3:])[row + at % columns]
+
+    rings = replay.transitions
+    reward = gather(rings.reward, first)
+    discount = jnp.full(shape, gamma, jnp.float32)
+    last = first
+    for _ in range(n_step - 1):
+        goes_on = ~gather(rings.done, last) & (last < iteration)
+        last = jnp.where(goes_on, last + 1, last)
+        reward = reward + jnp.where(goes_on, discount * gather(rings.reward, last), 0.0)
+        discount = jnp.where(goes_on, discount * gamma, discount)
+    batch = Batch(
+        obs=jax.tree.map(lambda ring: gather(ring, first), rings.obs),
+        action=gather(rings.action, first),
+        reward=reward,
+        next_obs=jax.tree.map(lambda ring: gather(ring, last), rings.next_obs),
+        discount=jnp.where(gather(rings.terminated, last), 0.0, discount),
+    )
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(batches, sources * share, *x.shape[3:]), batch)
+
+
+def sample_rollouts(
+    replay: Replay, key: Key[Array, ""], iteration: Int[Array, ""], *, source: int, batch_size: int, steps: int, recent: int
+) -> Rollouts:
+    """Episodes of a source that ended within the last `recent` iterations, uniformly with replacement; consumes `key`.
+
+    Args:
+      iteration: the latest iteration written.
+      steps: transitions drawn (with replacement) from each episode.
+    """
+    episodes = jax.tree.map(lambda ring: ring[source], replay.episodes)
+    slots = episodes.end.shape[0]
+    columns = replay.transitions.action.shape[2]
+    key_episode, key_step = jax.random.split(key)
+    count = jnp.sum(episodes.end > iteration - recent, dtype=jnp.int32)
+    back = jax.random.randint(key_episode, (batch_size,), 0, jnp.maximum(count, 1))
+    picked = jax.tree.map(lambda ring: ring[(replay.finished[source] - 1 - back) % slots], episodes)
+    start = picked.end - picked.length + 1
+    offset = jax.random.randint(key_step, (batch_size, steps), 0, picked.length[:, None])
+
+    def gather(ring: Array, at: Int[Array, "..."]) -> Array:
+        env = picked.env.reshape(batch_size, *(1,) * (at.ndim - 1))
+        return ring[source, env, at % columns]
+
+    transitions = replay.transitions
+    return Rollouts(
+        w=picked.w,
+        initial_obs=jax.tree.map(lambda ring: gather(ring, start), transitions.obs),
+        steps=jax.tree.map(lambda ring: gather(ring, start[:, None] + offset), transitions),
+        length=picked.length,
+        episode_return=picked.episode_return,
+    )
+
+
+def recent_outcome(replay: Replay, *, source: int, window: int) -> dict[str, Any]:
+    """Mean return and success rate of a source's last `window` finished episodes; NaN before the first."""
+    slots = replay.episodes.env.shape[1]
+    count = jnp.minimum(replay.finished[source], window)
+    back = jnp.arange(window, dtype=jnp.int32)
+    slot = (replay.finished[source] - 1 - back) % slots
+    valid = back < count
+
+    def mean(values: Array) -> Array:
+        return jnp.mean(values[source, slot].astype(jnp.float32), where=valid)
+
+    return {
+        "episode_return": mean(replay.episodes.episode_return),
+        "success": mean(replay.episodes.success),
+        "length": mean(replay.episodes.length),
+    }

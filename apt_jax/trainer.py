@@ -1,0 +1,303 @@
+"""One seed of training as pure functions: `chunk` is a scan of iterations followed by an evaluation.
+
+    act -> step -> write -> learn -> adapt        every iteration
+    refresh the curriculum (beta)                 every `Config.refresh_every` environment steps
+    evaluate, keep or restore the policy          every `Config.eval_every` environment steps: the end of a chunk
+
+The caller batches over seeds and hyper-parameters and jits (`apt_jax.lanes`).  The clock is never batched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, Key
+
+from apt_jax import evaluation, learner, replay, workers
+from apt_jax.config import Config, HParams
+from apt_jax.curricula import make_curriculum
+from apt_jax.curricula.base import GENERATED, TARGET, Metrics
+from apt_jax.networks import QNetwork
+from apt_jax.specs import Obs, Params
+from apt_jax.task_space import TaskSpace
+
+
+class Clock(NamedTuple):
+    """How far training has come, the same for all seeds: iterations and environment steps of all sources."""
+
+    iteration: Int[Array, ""]
+    env_steps: Int[Array, ""]
+
+    @classmethod
+    def start(cls) -> Clock:
+        """The clock before the first iteration."""
+        return cls(jnp.int32(0), jnp.int32(0))
+
+
+class TrainState(NamedTuple):
+    """Everything of one seed that training changes."""
+
+    key: Key[Array, ""]
+    key_eval: Key[Array, ""]
+    learner: learner.LearnerState
+    kept: learner.Kept
+    curriculum: Any
+    replay: replay.Replay
+    workers: workers.Workers
+
+
+class Trainer(NamedTuple):
+    """Pure, unbatched functions of one seed.
+
+    Attributes:
+      space: the task space.
+      config: the static configuration.
+      generates: whether there is a generated source.
+      init: `init(key, hparams) -> TrainState`; consumes `key`.
+      warmup: `warmup(state, clock, hparams) -> (state, clock)`: `Config.warmup_steps` of random actions, no updates.
+      chunk: `chunk(state, clock, hparams) -> (state, clock, metrics)`: `Config.eval_every` steps, then an evaluation.
+      propose: `propose(state, key, n) -> w`: tasks the curriculum would generate now, leaves [n, ...]; consumes `key`.
+      act: `act(params, obs) -> action`: greedy, for observations with any leading axes.
+    """
+
+    space: TaskSpace
+    config: Config
+    generates: bool
+    init: Callable[[Key[Array, ""], HParams], TrainState]
+    warmup: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock]]
+    chunk: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock, Metrics]]
+    propose: Callable[[TrainState, Key[Array, ""], int], Params]
+    act: Callable[[Any, Obs], Int[Array, "..."]]
+
+
+def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
+    """The trainer of a configuration for one target task of `space`.
+
+    Raises:
+      ValueError: an unknown method, or sizes that do not fit together (what, and what is allowed).
+    """
+    curriculum = make_curriculum(space, config)
+    sources = 2 if curriculum.generates else 1
+    validate(config, sources, space.horizon)
+    network = QNetwork(space.obs_spec, space.num_actions)
+    envs = config.envs_per_source
+    steps = sources * envs
+
+    def assign(state: Any, key: Key[Array, ""]) -> workers.Assignment:
+        w = curriculum.propose(state, key, envs) if curriculum.generates else None
+        return workers.assign(space, target, w, envs)
+
+    def init(key: Key[Array, ""], hparams: HParams) -> TrainState:
+        key, key_eval, key_learner, key_curriculum, key_assign, key_start = jax.random.split(key, 6)
+        learner_state = learner.init(network, key_learner)
+        curriculum_state = curriculum.init(key_curriculum, hparams)
+        return TrainState(
+            key=key,
+            key_eval=key_eval,
+            learner=learner_state,
+            kept=learner.Kept(jax.tree.map(jnp.copy, learner_state), jnp.float32(jnp.nan)),
+            curriculum=curriculum_state,
+            replay=replay.init(
+                space.obs_spec,
+                space.param_spec,
+                sources=sources,
+                envs=envs,
+                columns=config.replay_steps // envs,
+                episodes=config.replay_episodes,
+            ),
+            workers=workers.start(space, assign(curriculum_state, key_assign), key_start),
+        )
+
+    def collect(state: TrainState, clock: Clock, key: Key[Array, ""], epsilon: Any) -> TrainState:
+        """Act, step and write: one step of every environment.  All writes come before any read of the rings."""
+        key_act, key_assign, key_step = jax.random.split(key, 3)
+        action = learner.epsilon_greedy(network, state.learner.params, state.workers.obs, key_act, epsilon)
+        assignment = assign(state.curriculum, key_assign)
+        after, transition, episode, done = workers.step(space, state.workers, action, assignment, clock.iteration, key_step)
+        return state._replace(workers=after, replay=replay.write(state.replay, clock.iteration, transition, episode, done))
+
+    def tick(clock: Clock) -> Clock:
+        return Clock(clock.iteration + 1, clock.env_steps + steps)
+
+    def learn(state: TrainState, clock: Clock, key: Key[Array, ""], hparams: HParams) -> tuple[TrainState, Metrics]:
+        batches = replay.sample_transitions(
+            state.replay,
+            key,
+            clock.iteration,
+            batches=config.updates_per_step * steps,
+            batch_size=config.batch_size,
+            n_step=config.n_step,
+            gamma=hparams.gamma,
+        )
+        low, high = replay.return_range(state.replay)
+
+        def update(carry: learner.LearnerState, batch: replay.Batch) -> tuple[learner.LearnerState, Metrics]:
+            return learner.update(network, carry, batch, low=low, high=high, hparams=hparams)
+
+        learner_state, metrics = jax.lax.scan(update, state.learner, batches)
+        return state._replace(learner=learner_state), _mean(metrics)
+
+    def adapt(state: TrainState, clock: Clock, key: Key[Array, ""], hparams: HParams) -> tuple[TrainState, Metrics]:
+        def update(carry: Any, key: Key[Array, ""]) -> tuple[Any, Metrics]:
+            return curriculum.update(carry, key, state.replay, clock.iteration, hparams)
+
+        rounds = round(config.model_updates_per_step * steps)
+        curriculum_state, metrics = jax.lax.scan(update, state.curriculum, jax.random.split(key, rounds))
+        return state._replace(curriculum=curriculum_state), _mean(metrics)
+
+    def iteration(carry: tuple[TrainState, Clock], hparams: HParams) -> tuple[tuple[TrainState, Clock], Metrics]:
+        state, clock = carry
+        key, key_collect, key_learn, key_adapt = jax.random.split(state.key, 4)
+        epsilon = learner.epsilon_schedule(clock.env_steps - config.warmup_steps, hparams)
+        state = collect(state._replace(key=key), clock, key_collect, epsilon)
+        state, learner_metrics = learn(state, clock, key_learn, hparams)
+        state, curriculum_metrics = adapt(state, clock, key_adapt, hparams)
+        return (state, tick(clock)), {"epsilon": epsilon, **learner_metrics, **curriculum_metrics}
+
+    def warmup(state: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock]:
+        del hparams
+
+        def step(carry: tuple[TrainState, Clock], _: None) -> tuple[tuple[TrainState, Clock], None]:
+            state, clock = carry
+            key, key_collect = jax.random.split(state.key)
+            return (collect(state._replace(key=key), clock, key_collect, 1.0), tick(clock)), None
+
+        return jax.lax.scan(step, (state, clock), length=config.warmup_steps // steps)[0]
+
+    def evaluate(state: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Metrics]:
+        """Greedy return on the target, the restore rule, and the curriculum judged on fresh tasks.
+
+        Draws from `key_eval` alone, so that evaluating more or less often changes nothing in training.
+        """
+        key_target, key_propose, key_probe = jax.random.split(jax.random.fold_in(state.key_eval, clock.env_steps), 3)
+
+        def act(obs: Obs, key: Key[Array, ""]) -> Int[Array, "n"]:
+            del key
+            return learner.greedy(network, state.learner.params, obs)
+
+        targets = jax.tree.map(lambda x: jnp.broadcast_to(x, (config.eval_episodes, *jnp.shape(x))), target)
+        outcome = evaluation.play(space, targets, act, key_target)
+        score = jnp.mean(outcome.episode_return)
+        kept_learner, kept, restored = learner.keep_or_restore(state.learner, state.kept, score)
+        metrics = {
+            "target_return": kept.score,
+            "target_return_raw": score,
+            "target_success_raw": jnp.mean(outcome.success.astype(jnp.float32)),
+            "restored": restored.astype(jnp.float32),
+            **_sources(state.replay, config.return_window),
+        }
+        if curriculum.generates:
+            epsilon = learner.epsilon_schedule(clock.env_steps - config.warmup_steps, hparams)
+            w = curriculum.propose(state.curriculum, key_propose, config.probe_tasks)
+            tasks = jax.vmap(space.instantiate)(w)
+
+            def explore(obs: Obs, key: Key[Array, ""]) -> Int[Array, "n"]:
+                return learner.epsilon_greedy(network, state.learner.params, obs, key, epsilon)
+
+            probe = evaluation.play(space, tasks, explore, key_probe)
+            descriptions = jax.vmap(space.describe)(tasks)
+            metrics |= {
+                "probe_return": jnp.mean(probe.episode_return),
+                "probe_success": jnp.mean(probe.success.astype(jnp.float32)),
+                "probe_diversity": diversity(w),
+                **{f"probe_{name}": jnp.nanmean(values) for name, values in descriptions.items()},
+                **curriculum.report(state.curriculum, w, probe.episode_return),
+            }
+        return state._replace(learner=kept_learner, kept=kept), metrics
+
+    def chunk(state: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock, Metrics]:
+        def refresh_period(carry: tuple[TrainState, Clock], _: None) -> tuple[tuple[TrainState, Clock], Metrics]:
+            (state, clock), metrics = jax.lax.scan(
+                lambda c, _: iteration(c, hparams), carry, length=config.refresh_every // steps
+            )
+            refreshed = curriculum.refresh(state.curriculum, state.replay, hparams)
+            return (state._replace(curriculum=refreshed), clock), _mean(metrics)
+
+        (state, clock), metrics = jax.lax.scan(refresh_period, (state, clock), length=config.eval_every // config.refresh_every)
+        state, eval_metrics = evaluate(state, clock, hparams)
+        return state, clock, {**_mean(metrics), **eval_metrics}
+
+    def propose(state: TrainState, key: Key[Array, ""], n: int) -> Params:
+        return curriculum.propose(state.curriculum, key, n)
+
+    def act(params: Any, obs: Obs) -> Int[Array, "..."]:
+        return learner.greedy(network, params, obs)
+
+    return Trainer(space, config, curriculum.generates, init, warmup, chunk, propose, act)
+
+
+def validate(config: Config, sources: int, horizon: int) -> None:
+    """Check that the sizes of a configuration fit together.
+
+    Raises:
+      ValueError: what does not fit, and what is allowed.
+    """
+    steps = sources * config.envs_per_source
+    rounds = config.model_updates_per_step * steps
+
+    def require(holds: bool, message: str) -> None:
+        if not holds:
+            raise ValueError(message)
+
+    require(config.envs_per_source >= 1, f"envs_per_source must be at least 1, got {config.envs_per_source}")
+    for name in ("warmup_steps", "refresh_every", "eval_every"):
+        size = getattr(config, name)
+        require(
+            size > 0 and size % steps == 0,
+            f"{name} must be a positive multiple of the {steps} environment steps of one iteration, got {size}",
+        )
+    require(
+        config.eval_every % config.refresh_every == 0,
+        f"eval_every must be a multiple of refresh_every={config.refresh_every}, got {config.eval_every}",
+    )
+    require(
+        config.batch_size >= sources and config.batch_size % sources == 0,
+        f"batch_size must be a positive multiple of the {sources} sources, got {config.batch_size}",
+    )
+    require(
+        config.warmup_steps >= horizon * steps,
+        f"warmup_steps must let every environment finish an episode: at least {horizon * steps}, got {config.warmup_steps}",
+    )
+    require(
+        rounds >= 1 and abs(rounds - round(rounds)) < 1e-6,
+        f"model_updates_per_step must give a whole number of updates per iteration of {steps} steps, got {rounds:g}",
+    )
+    needed = config.recent_steps + horizon * config.envs_per_source
+    require(
+        config.replay_steps >= needed and config.replay_steps % config.envs_per_source == 0,
+        f"replay_steps must be a multiple of envs_per_source and hold recent_steps and one more horizon: at least {needed}, "
+        f"got {config.replay_steps}",
+    )
+    for name in (
+        "updates_per_step",
+        "replay_episodes",
+        "eval_episodes",
+        "probe_tasks",
+        "return_window",
+        "rollout_steps",
+        "n_step",
+    ):
+        require(getattr(config, name) >= 1, f"{name} must be at least 1, got {getattr(config, name)}")
+
+
+def diversity(w: Params) -> Any:
+    """Mean standard deviation of a task parameter's components over tasks (leaves [n, ...])."""
+    return jnp.mean(jnp.concatenate([jnp.std(leaf, axis=0).ravel() for leaf in jax.tree.leaves(w)]))
+
+
+def _sources(rings: replay.Replay, window: int) -> Metrics:
+    """Recent outcome of each source as the behaviour policy had it."""
+    names = {TARGET: "behaviour", GENERATED: "generated"}
+    return {
+        f"{names[source]}_{name}": value
+        for source in range(rings.finished.shape[0])
+        for name, value in replay.recent_outcome(rings, source=source, window=window).items()
+    }
+
+
+def _mean(metrics: Metrics) -> Metrics:
+    """Mean over the leading axis of a scan."""
+    return jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)

@@ -1,0 +1,89 @@
+"""Environments that collect experience: step, and start a fresh episode where one ended.  Axes: S sources, E environments."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from apt_jax.replay import Episode, Transition
+from apt_jax.specs import Obs, Params, param_struct, zeros_like
+from apt_jax.task_space import TaskSpace
+
+
+class Workers(NamedTuple):
+    """Environments in the middle of their episodes; leaves [S, E, ...].
+
+    `w` is the parameter of the current task (zeros for the target), `length` and `episode_return` count the current episode.
+    """
+
+    state: Any
+    obs: Obs
+    task: Any
+    w: Params
+    length: Int[Array, "S E"]
+    episode_return: Float[Array, "S E"]
+
+
+class Assignment(NamedTuple):
+    """Tasks for environments about to reset, with their parameters; leaves [S, E, ...]."""
+
+    task: Any
+    w: Params
+
+
+def assign(space: TaskSpace, target: Any, w: Params | None, envs: int) -> Assignment:
+    """The target for source 0 and, if there is a generated source, tasks of `w` (leaves [E, ...]) for source 1."""
+    targets = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, envs, *jnp.shape(x))), target)
+    no_w = zeros_like(param_struct(space.param_spec), (1, envs))
+    if w is None:
+        return Assignment(targets, no_w)
+    generated = Assignment(jax.vmap(space.instantiate)(w), w)
+    stacked = jax.tree.map(lambda x: x[None], generated)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b.astype(a.dtype)]), Assignment(targets, no_w), stacked)
+
+
+def start(space: TaskSpace, assignment: Assignment, key: Key[Array, ""]) -> Workers:
+    """All environments at the beginning of an episode; consumes `key`."""
+    shape = jax.tree.leaves(assignment.w)[0].shape[:2]
+    state, obs = _grid(space.reset)(jax.random.split(key, shape), assignment.task)
+    return Workers(state, obs, assignment.task, assignment.w, jnp.zeros(shape, jnp.int32), jnp.zeros(shape))
+
+
+def step(
+    space: TaskSpace,
+    workers: Workers,
+    action: Int[Array, "S E"],
+    assignment: Assignment,
+    iteration: Int[Array, ""],
+    key: Key[Array, ""],
+) -> tuple[Workers, Transition, Episode, Bool[Array, "S E"]]:
+    """Step every environment; where its episode ends, reset it into its assigned task; consumes `key`.
+
+    Returns:
+      The workers after the reset, the transitions with their true final observations, the episodes as they would end with this
+      step, and which of them did.
+    """
+    out = _grid(space.step)(workers.state, action, workers.task)
+    done = out.terminated | out.truncated
+    length = workers.length + 1
+    episode_return = workers.episode_return + out.reward
+    transition = Transition(workers.obs, action, out.reward, out.obs, out.terminated, done)
+    env = jnp.broadcast_to(jnp.arange(done.shape[1], dtype=jnp.int32), done.shape)
+    end = jnp.broadcast_to(iteration, done.shape)
+    episode = Episode(workers.w, env, end, length, episode_return, out.success)
+
+    going_on = Workers(out.state, out.obs, workers.task, workers.w, length, episode_return)
+    fresh = start(space, assignment, key)
+
+    def select(new: Array, old: Array) -> Array:
+        return jnp.where(done.reshape(*done.shape, *(1,) * (new.ndim - 2)), new, old)
+
+    return jax.tree.map(select, fresh, going_on), transition, episode, done
+
+
+def _grid(function: Any) -> Any:
+    """Map over sources and environments."""
+    return jax.vmap(jax.vmap(function))

@@ -1,0 +1,166 @@
+"""The rings against a plain list of everything that was written."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from apt_jax import replay
+from apt_jax.specs import Vector
+
+SOURCES, ENVS, COLUMNS, SLOTS = 2, 3, 16, 8
+OBS = {"x": Vector(1, 0, 1000)}
+PARAM = {"p": Vector(2, 0, 1000)}
+
+
+def _code(source, env, iteration):
+    """A number that tells where and when an observation was made."""
+    return iteration + 100 * env + 10_000 * source
+
+
+def _written(iterations, seed=0):
+    """A replay written for some iterations with random episode ends, and the list of its finished episodes per source."""
+    rng = np.random.default_rng(seed)
+    rings = replay.init(OBS, PARAM, sources=SOURCES, envs=ENVS, columns=COLUMNS, episodes=SLOTS)
+    length = np.zeros((SOURCES, ENVS), np.int32)
+    finished = [[], []]
+    source, env = np.meshgrid(np.arange(SOURCES), np.arange(ENVS), indexing="ij")
+    write = jax.jit(replay.write)
+    for iteration in range(iterations):
+        length += 1
+        done = rng.random((SOURCES, ENVS)) < 0.3
+        code = _code(source, env, iteration)
+        transition = replay.Transition(
+            obs={"x": jnp.asarray(code[..., None], jnp.float32)},
+            action=jnp.asarray(iteration % 4 + 0 * source),
+            reward=jnp.asarray(code, jnp.float32),
+            next_obs={"x": jnp.asarray(code[..., None] + 1, jnp.float32)},
+            terminated=jnp.asarray(done & (iteration % 2 == 0)),
+            done=jnp.asarray(done),
+        )
+        returns = (rng.random((SOURCES, ENVS)) - 0.5).astype(np.float32)
+        episode = replay.Episode(
+            w={"p": jnp.asarray(np.stack([code, code + 0.5], -1), jnp.float32)},
+            env=jnp.asarray(env, jnp.int32),
+            end=jnp.full((SOURCES, ENVS), iteration, jnp.int32),
+            length=jnp.asarray(length),
+            episode_return=jnp.asarray(returns),
+            success=jnp.asarray(returns > 0),
+        )
+        rings = write(rings, jnp.int32(iteration), transition, episode, jnp.asarray(done))
+        for s, e in zip(*np.nonzero(done), strict=True):
+            finished[s].append((e, iteration, length[s, e], returns[s, e]))
+        length[done] = 0
+    return rings, finished
+
+
+@pytest.mark.parametrize("iterations", [5, 16, 41])
+def test_transitions_lie_at_their_iteration_modulo_the_capacity(iterations):
+    rings, _ = _written(iterations)
+    stored = np.asarray(rings.transitions.obs["x"])[..., 0]
+    for iteration in range(max(0, iterations - COLUMNS), iterations):
+        expected = [[_code(s, e, iteration) for e in range(ENVS)] for s in range(SOURCES)]
+        np.testing.assert_array_equal(stored[:, :, iteration % COLUMNS], expected)
+
+
+@pytest.mark.parametrize("iterations", [5, 41])
+def test_finished_episodes_are_kept_in_order_and_counted(iterations):
+    rings, finished = _written(iterations)
+    for source in range(SOURCES):
+        count = len(finished[source])
+        assert rings.finished[source] == count
+        for i in range(max(0, count - SLOTS), count):
+            env, end, length, episode_return = finished[source][i]
+            slot = jax.tree.map(lambda ring, i=i, source=source: np.asarray(ring[source, i % SLOTS]), rings.episodes)
+            assert (slot.env, slot.end, slot.length) == (env, end, length)
+            assert slot.episode_return == episode_return
+            assert slot.w["p"][0] == _code(source, env, end)
+
+
+def test_return_range_covers_finished_episodes_of_all_sources_and_is_unbounded_before():
+    rings, finished = _written(30)
+    returns = [episode[3] for source in finished for episode in source]
+    np.testing.assert_allclose(replay.return_range(rings), [min(returns), max(returns)])
+    empty = replay.init(OBS, PARAM, sources=SOURCES, envs=ENVS, columns=COLUMNS, episodes=SLOTS)
+    np.testing.assert_array_equal(replay.return_range(empty), [-np.inf, np.inf])
+
+
+@pytest.mark.parametrize("iterations", [3, 41])
+def test_sampled_transitions_are_whole_recent_and_equally_shared(iterations):
+    rings, _ = _written(iterations)
+    batch = replay.sample_transitions(
+        rings, jax.random.key(1), jnp.int32(iterations - 1), batches=50, batch_size=64, n_step=1, gamma=0.5
+    )
+    code = np.asarray(batch.reward)
+    assert code.shape == (50, 64)
+    np.testing.assert_array_equal(np.asarray(batch.obs["x"])[..., 0], code)
+    np.testing.assert_array_equal(np.asarray(batch.next_obs["x"])[..., 0], code + 1)
+    source, iteration = code // 10_000, code % 100
+    assert (np.sum(source == 0, axis=1) == 32).all()
+    assert iteration.min() >= max(0, iterations - COLUMNS) and iteration.max() < iterations
+    written = min(iterations, COLUMNS) * ENVS * SOURCES
+    assert len(np.unique(code)) == written, "3,200 draws from at most 96 rows miss none"
+
+
+@pytest.mark.parametrize("n_step", [1, 2, 4])
+def test_n_step_transitions_stop_at_the_end_of_the_episode_and_of_what_is_written(n_step):
+    iterations, gamma = 41, 0.5
+    rings, _ = _written(iterations)
+    stored = jax.tree.map(np.asarray, rings.transitions)
+    batch = replay.sample_transitions(
+        rings, jax.random.key(1), jnp.int32(iterations - 1), batches=20, batch_size=64, n_step=n_step, gamma=gamma
+    )
+    batch = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[2:]), batch)
+    spans = set()
+    for first, reward, after, discount in zip(
+        batch.obs["x"][:, 0], batch.reward, batch.next_obs["x"][:, 0], batch.discount, strict=True
+    ):
+        source, env, iteration = int(first // 10_000), int(first % 10_000 // 100), int(first % 100)
+        expected, span = 0.0, 0
+        while True:
+            at = (source, env, (iteration + span) % COLUMNS)
+            expected += gamma**span * stored.reward[at]
+            span += 1
+            if span == n_step or stored.done[at] or iteration + span == iterations:
+                break
+        spans.add(span)
+        np.testing.assert_allclose(reward, expected, rtol=1e-6)
+        assert after == first + span
+        assert discount == (0.0 if stored.terminated[at] else gamma**span)
+    assert spans == set(range(1, n_step + 1))
+
+
+def test_sampled_rollouts_are_consistent_episodes_within_the_window():
+    iterations, recent = 41, 8
+    rings, finished = _written(iterations)
+    for source in range(SOURCES):
+        rollouts = replay.sample_rollouts(
+            rings, jax.random.key(2), jnp.int32(iterations - 1), source=source, batch_size=256, steps=5, recent=recent
+        )
+        eligible = {(e, end): (n, r) for e, end, n, r in finished[source][-SLOTS:] if end > iterations - 1 - recent}
+        rollouts = jax.tree.map(np.asarray, rollouts)
+        w = rollouts.w["p"][:, 0]
+        seen = set()
+        for b in range(256):
+            env, end = int(w[b] % 10_000 // 100), int(w[b] % 100)
+            length, episode_return = eligible[env, end]
+            seen.add((env, end))
+            assert rollouts.length[b] == length
+            assert rollouts.episode_return[b] == episode_return
+            first = _code(source, env, end - length + 1)
+            assert rollouts.initial_obs["x"][b, 0] == first
+            steps = rollouts.steps.reward[b]
+            assert ((first <= steps) & (steps < first + length)).all()
+        assert seen == set(eligible)
+
+
+def test_recent_outcome_is_the_mean_of_the_last_episodes_only():
+    rings, finished = _written(41)
+    outcome = replay.recent_outcome(rings, source=1, window=4)
+    last = [episode[3] for episode in finished[1][-4:]]
+    np.testing.assert_allclose(outcome["episode_return"], np.mean(last), rtol=1e-6)
+    np.testing.assert_allclose(outcome["success"], np.mean(np.array(last) > 0))
+    empty = replay.init(OBS, PARAM, sources=SOURCES, envs=ENVS, columns=COLUMNS, episodes=SLOTS)
+    assert np.isnan(replay.recent_outcome(empty, source=0, window=4)["episode_return"])

@@ -1,0 +1,165 @@
+"""Invariants of the training program, on a task space that compiles fast."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.corridor import Corridor
+
+from apt_jax.config import Config, HParams
+from apt_jax.lanes import make_program, stack_hparams
+from apt_jax.trainer import Clock, make_trainer
+
+SPACE = Corridor()
+TARGET = np.int32(7)
+CONFIG = Config(
+    envs_per_source=2,
+    warmup_steps=100,
+    updates_per_step=1,
+    batch_size=16,
+    replay_steps=200,
+    replay_episodes=64,
+    model_updates_per_step=0.5,
+    model_batch_size=8,
+    recent_steps=100,
+    refresh_every=20,
+    eval_every=40,
+    eval_episodes=2,
+    probe_tasks=8,
+    return_window=10,
+)
+METHODS = ("apt_gen", "random", "target_only")
+
+
+def config(method: str, **changes) -> Config:
+    return dataclasses.replace(CONFIG, method=method, **changes)
+
+
+def run(cfg, seeds, chunks=2, layout="map", hparams=None, devices=None):
+    """States and metrics of every chunk for some seeds."""
+    program = make_program(make_trainer(SPACE, TARGET, cfg), len(seeds), layout=layout, devices=devices)
+    lanes = stack_hparams(hparams or [HParams()] * len(seeds))
+    states = program.init(jax.vmap(jax.random.key)(np.array(seeds)), lanes)
+    states, clock = program.warmup(states, Clock.start(), lanes)
+    history = []
+    for _ in range(chunks):
+        states, clock, metrics = program.chunk(states, clock, lanes)
+        history.append(metrics)
+    return states, clock, history
+
+
+def leaves(tree):
+    """Comparable numpy leaves, keys as their data."""
+    return [
+        np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x) for x in jax.tree.leaves(tree)
+    ]
+
+
+def assert_lane_equal(several, lane, alone, rtol=1e-4, atol=1e-5):
+    for a, b in zip(leaves(several), leaves(alone), strict=True):
+        np.testing.assert_allclose(a[lane], b[0], rtol=rtol, atol=atol)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_metrics_are_finite_and_the_clock_counts_every_source(method):
+    _, clock, history = run(config(method), [0, 1])
+    assert clock.env_steps == 180
+    assert clock.iteration == (90 if method == "target_only" else 45)
+    for metrics in history:
+        for name, value in metrics.items():
+            assert value.shape == (2,), name
+            assert np.isfinite(value).all(), name
+
+
+@pytest.mark.parametrize("layout", ["map", "vmap"])
+def test_a_seed_alone_equals_the_same_seed_among_others(layout):
+    """Float reassociation is the only difference allowed; on two devices three lanes also exercise the padding."""
+    several, _, _ = run(config("apt_gen"), [3, 4, 5], layout=layout)
+    for lane, seed in enumerate([3, 4, 5]):
+        alone, _, _ = run(config("apt_gen"), [seed])
+        assert_lane_equal(several, lane, alone)
+
+
+def test_hyper_parameter_lanes_equal_separate_runs():
+    lanes = [HParams(delta=0.1, gamma=0.9), HParams(delta=0.9, gamma=0.5)]
+    several, _, _ = run(config("apt_gen"), [1, 1], hparams=lanes, layout="vmap")
+    for lane, hparams in enumerate(lanes):
+        alone, _, _ = run(config("apt_gen"), [1], hparams=[hparams])
+        assert_lane_equal(several, lane, alone)
+    first, second = (leaves(jax.tree.map(lambda x, i=i: x[i], several.learner.params)) for i in (0, 1))
+    assert any(not np.allclose(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_seeds_differ():
+    states, _, _ = run(config("random"), [0, 1], chunks=1)
+    kernels = leaves(states.learner.params)
+    assert all(not np.array_equal(k[0], k[1]) for k in kernels)
+
+
+def test_each_program_compiles_once():
+    trainer = make_trainer(SPACE, TARGET, config("apt_gen"))
+    program = make_program(trainer, 2)
+    lanes = stack_hparams([HParams()] * 2)
+    states = program.init(jax.random.split(jax.random.key(0), 2), lanes)
+    states, clock = program.warmup(states, Clock.start(), lanes)
+    for _ in range(3):
+        states, clock, _ = program.chunk(states, clock, lanes)
+        lanes = lanes.replace(delta=lanes.delta + np.float32(0.1))
+    assert program.chunk._cache_size() == 1
+    assert program.warmup._cache_size() == 1
+    assert program.init._cache_size() == 1
+
+
+def test_states_are_donated():
+    program = make_program(make_trainer(SPACE, TARGET, config("random")), 1, layout="vmap")
+    lanes = stack_hparams([HParams()])
+    states = program.init(jax.random.split(jax.random.key(0), 1), lanes)
+    program.warmup(states, Clock.start(), lanes)
+    assert states.replay.transitions.reward.is_deleted()
+
+
+def test_evaluating_more_often_changes_nothing_in_training():
+    often, _, _ = run(config("apt_gen", eval_every=20), [2], chunks=4)
+    seldom, _, _ = run(config("apt_gen", eval_every=80), [2], chunks=1)
+    # A restore would be such a change by intent; the corridor's target is not solved this early.
+    assert float(often.kept.score[0]) < 0
+    for a, b in zip(leaves(often.replay), leaves(seldom.replay), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_target_source_plays_only_the_target_and_the_generated_source_its_w():
+    states, _, _ = run(config("random"), [0])
+    assert (np.asarray(states.workers.task)[0, 0] == TARGET).all()
+    w = jax.tree.map(lambda x: x[0, 1], states.workers.w)
+    np.testing.assert_array_equal(states.workers.task[0, 1], jax.vmap(SPACE.instantiate)(w))
+
+
+def test_the_final_observation_is_stored_not_the_reset_one():
+    states, _, _ = run(config("random"), [0])
+    steps = jax.tree.map(lambda x: np.asarray(x[0]).reshape(-1, *x.shape[4:]), states.replay.transitions)
+    ended = steps.terminated & (steps.reward > 0)
+    assert ended.any()
+    assert (steps.next_obs["offset"][ended] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"method": "apt-gen"}, "Did you mean 'apt_gen'"),
+        ({"batch_size": 15}, "batch_size .* 2 sources, got 15"),
+        ({"eval_every": 50}, "eval_every must be a multiple of refresh_every=20, got 50|multiple of the 4"),
+        ({"refresh_every": 18}, "refresh_every .* 4 environment steps"),
+        ({"warmup_steps": 40}, "warmup_steps .* at least 48, got 40"),
+        ({"model_updates_per_step": 0.3}, "whole number of updates"),
+        ({"replay_steps": 100}, "replay_steps .* at least 124"),
+        ({"envs_per_source": 0}, "envs_per_source"),
+        ({"eval_episodes": 0}, "eval_episodes must be at least 1"),
+    ],
+)
+def test_sizes_that_do_not_fit_are_named(changes, words):
+    with pytest.raises(ValueError, match=words):
+        make_trainer(SPACE, TARGET, dataclasses.replace(CONFIG, **changes))
