@@ -27,6 +27,8 @@ class HParams:
       beta_init: beta at the start.
       beta_min: lower bound of beta (paper: 1/8).
       beta_max: upper bound of beta (paper: 8).
+      pessimism: standard deviations of the value ensemble taken off its mean, >= 0.
+      value_weight_decay: decoupled weight decay of the value networks, per unit of their learning rate, >= 0.
       spectral_bound: spectral norm of every layer of the discriminator, > 0.
     """
 
@@ -44,6 +46,8 @@ class HParams:
     beta_init: float = 1.0
     beta_min: float = 0.125
     beta_max: float = 8.0
+    pessimism: float = 1.0
+    value_weight_decay: float = 0.0
     spectral_bound: float = 0.8
 
 
@@ -67,6 +71,7 @@ class Config:
       rollout_steps: transitions of each rollout that the discriminator sees in one update.
       recent_steps: discriminator and values learn from the latest so many steps of each source (paper: 10,000).
       progress: whether V1 learns the discriminator's "probability" (the paper's form) or its "logit".
+      value_ensemble: networks behind each of V1 and V2, whose estimate is their mean less `pessimism` deviations (paper: 1).
       noise_size: length of the generator's noise z.
       refresh_every: steps between updates of beta (paper: 500).
       return_window: episodes over which the generated return is averaged for beta (paper: 50).
@@ -88,6 +93,7 @@ class Config:
     rollout_steps: int = 4
     recent_steps: int = 10_000
     progress: Literal["probability", "logit"] = "logit"
+    value_ensemble: int = 1
     noise_size: int = 32
     refresh_every: int = 500
     return_window: int = 50

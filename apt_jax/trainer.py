@@ -38,8 +38,9 @@ class Clock(NamedTuple):
 
 
 class TrainState(NamedTuple):
-    """Everything of one seed that training changes."""
+    """Everything of one seed.  The target is data, so that one compiled program serves every target of a space."""
 
+    target: Any
     key: Key[Array, ""]
     key_eval: Key[Array, ""]
     learner: learner.LearnerState
@@ -86,7 +87,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
     envs = config.envs_per_source
     steps = sources * envs
 
-    def assign(state: Any, key: Key[Array, ""]) -> workers.Assignment:
+    def assign(target: Any, state: Any, key: Key[Array, ""]) -> workers.Assignment:
         w = curriculum.propose(state, key, envs) if curriculum.generates else None
         return workers.assign(space, target, w, envs)
 
@@ -95,6 +96,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         learner_state = learner.init(network, key_learner)
         curriculum_state = curriculum.init(key_curriculum, hparams)
         return TrainState(
+            target=jax.tree.map(jnp.asarray, target),
             key=key,
             key_eval=key_eval,
             learner=learner_state,
@@ -108,14 +110,14 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
                 columns=config.replay_steps // envs,
                 episodes=config.replay_episodes,
             ),
-            workers=workers.start(space, assign(curriculum_state, key_assign), key_start),
+            workers=workers.start(space, assign(target, curriculum_state, key_assign), key_start),
         )
 
     def collect(state: TrainState, clock: Clock, key: Key[Array, ""], epsilon: Any) -> TrainState:
         """Act, step and write: one step of every environment.  All writes come before any read of the rings."""
         key_act, key_assign, key_step = jax.random.split(key, 3)
         action = learner.epsilon_greedy(network, state.learner.params, state.workers.obs, key_act, epsilon)
-        assignment = assign(state.curriculum, key_assign)
+        assignment = assign(state.target, state.curriculum, key_assign)
         after, transition, episode, done = workers.step(space, state.workers, action, assignment, clock.iteration, key_step)
         return state._replace(workers=after, replay=replay.write(state.replay, clock.iteration, transition, episode, done))
 
@@ -178,7 +180,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             del key
             return learner.greedy(network, state.learner.params, obs)
 
-        targets = jax.tree.map(lambda x: jnp.broadcast_to(x, (config.eval_episodes, *jnp.shape(x))), target)
+        targets = jax.tree.map(lambda x: jnp.broadcast_to(x, (config.eval_episodes, *jnp.shape(x))), state.target)
         outcome = evaluation.play(space, targets, act, key_target)
         score = jnp.mean(outcome.episode_return)
         kept_learner, kept, restored = learner.keep_or_restore(state.learner, state.kept, score)

@@ -82,19 +82,23 @@ def apt_gen(space: TaskSpace, config: Config) -> Curriculum:
         )
         return pool(initial, transitions, rollouts.length)
 
-    def evaluate(params: Any, w: Params) -> Float[Array, "..."]:
-        return apply(value, params, as_instantiated(space.param_spec, w))
+    def evaluate(params: Any, w: Params) -> Float[Array, "K n"]:
+        """What each network of an ensemble says of tasks (leaves [n, ...])."""
+        return jax.vmap(lambda member: apply(value, member, as_instantiated(space.param_spec, w)))(params)
+
+    def init_ensemble(key: Key[Array, ""]) -> Any:
+        w = zeros_like(param_struct(space.param_spec))
+        return jax.vmap(lambda key: value.init(key, w))(jax.random.split(key, config.value_ensemble))
 
     def init(key: Key[Array, ""], hparams: HParams) -> AptGenState:
         key_g, key_d, key_1, key_2, key_spectral, key_stats = jax.random.split(key, 6)
         variables = generator.init(key_g, jnp.zeros((2, config.noise_size)), train=True)
-        w = zeros_like(param_struct(space.param_spec))
         obs = zeros_like(obs_struct(space.obs_spec))
         models = Models(
             generator=variables["params"],
             discriminator=discriminator.init(key_d, obs, jnp.int32(0), reward=jnp.float32(0.0), next_obs=obs),
-            progress_value=value.init(key_1, w),
-            return_value=value.init(key_2, w),
+            progress_value=init_ensemble(key_1),
+            return_value=init_ensemble(key_2),
         )
 
         # The first tasks are drawn from running statistics, which must describe the fresh generator before it is used.
@@ -141,12 +145,13 @@ def apt_gen(space: TaskSpace, config: Config) -> Curriculum:
             loss_d = discriminator_loss(target_logit, generated_logit)
 
             progress = jax.lax.stop_gradient(progress_score(generated_logit, config.progress))
-            progress_error = evaluate(models.progress_value, generated.w) - progress
-            return_error = evaluate(models.return_value, generated.w) - generated.episode_return
+            progress_error = evaluate(models.progress_value, generated.w) - progress[None]
+            return_error = evaluate(models.return_value, generated.w) - generated.episode_return[None]
 
             w, batch_stats = generate(models.generator, state.batch_stats, z)
             frozen = jax.lax.stop_gradient(models)
-            progress_value, return_value = evaluate(frozen.progress_value, w), evaluate(frozen.return_value, w)
+            progress_value = pessimistic(evaluate(frozen.progress_value, w), hparams.pessimism)
+            return_value = pessimistic(evaluate(frozen.return_value, w), hparams.pessimism)
             objective = generator_objective(progress_value, return_value, beta=state.beta, delta=hparams.delta)
             metrics = {
                 "discriminator_loss": loss_d,
@@ -160,7 +165,10 @@ def apt_gen(space: TaskSpace, config: Config) -> Curriculum:
                 "generator_progress": jnp.mean(progress_value),
                 "generator_return": jnp.mean(return_value),
             }
-            total = loss_d + jnp.mean(progress_error**2) + jnp.mean(return_error**2) - objective
+            # Sums over the ensemble: each network has a loss of its own.
+            loss_1 = jnp.sum(jnp.mean(progress_error**2, axis=1))
+            loss_2 = jnp.sum(jnp.mean(return_error**2, axis=1))
+            total = loss_d + loss_1 + loss_2 - objective
             return total, (batch_stats, spectral, metrics)
 
         grads, (batch_stats, spectral, metrics) = jax.grad(loss, has_aux=True)(state.models)
@@ -172,6 +180,11 @@ def apt_gen(space: TaskSpace, config: Config) -> Curriculum:
             return_value=hparams.value_learning_rate,
         )
         models = Models(*map(_descend, state.models, direction, rates))
+        shrink = 1.0 - hparams.value_learning_rate * hparams.value_weight_decay
+        models = models._replace(
+            progress_value=jax.tree.map(lambda p: p * shrink, models.progress_value),
+            return_value=jax.tree.map(lambda p: p * shrink, models.return_value),
+        )
         return AptGenState(models, opt_state, batch_stats, spectral, state.beta), metrics
 
     def refresh(state: AptGenState, replay: rp.Replay, hparams: HParams) -> AptGenState:
@@ -187,7 +200,7 @@ def apt_gen(space: TaskSpace, config: Config) -> Curriculum:
         return state._replace(beta=beta)
 
     def report(state: AptGenState, w: Params, episode_return: Float[Array, "n"]) -> Metrics:
-        predicted = evaluate(state.models.return_value, w)
+        predicted = jnp.mean(evaluate(state.models.return_value, w), axis=0)
         return {
             "beta": state.beta,
             "v2_correlation": correlation(predicted, episode_return),
@@ -204,6 +217,13 @@ def _descend(params: Any, direction: Any, rate: Float[Array, ""] | float) -> Any
 def progress_score(logit: Float[Array, "B"], form: str) -> Float[Array, "B"]:
     """The task progress eta that V1 learns: the discriminator's "probability" (the paper's form) or its "logit"."""
     return jax.nn.sigmoid(logit) if form == "probability" else logit
+
+
+def pessimistic(values: Float[Array, "K n"], pessimism: Float[Array, ""] | float) -> Float[Array, "n"]:
+    """Mean of an ensemble less `pessimism` standard deviations: where the networks disagree there was little experience."""
+    if values.shape[0] == 1:
+        return values[0]
+    return jnp.mean(values, axis=0) - pessimism * jnp.std(values, axis=0)
 
 
 def correlation(a: Float[Array, "n"], b: Float[Array, "n"]) -> Float[Array, ""]:
