@@ -1,0 +1,1 @@
+"""Scripts around the trainer: everything that touches files, terminals and processes."""

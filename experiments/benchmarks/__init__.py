@@ -1,0 +1,1 @@
+"""Timings; no test depends on one."""

@@ -1,0 +1,216 @@
+"""What the benchmarks share: pinning, timing, fresh processes, and the files and tables that results end up in."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import multiprocessing
+import os
+import platform
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from apt_jax.config import PRESETS, Config, HParams
+from experiments import runtime
+from experiments.errors import UsageError
+
+C = TypeVar("C")
+F = TypeVar("F")
+P = ParamSpec("P")
+R = TypeVar("R")
+
+SPACE, TARGET = "grid_world", "A"
+
+_LOAD_AVERAGE = os.getloadavg()
+"""Before the benchmark starts: above zero, something else was running and the timings are not to be trusted."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What every benchmark can be told.
+
+    Attributes:
+      out: the JSON file to write, by default runs/benchmarks/NAME.json.
+      repeats: how often each measurement is taken; medians and ranges are over these.
+      quick: everything tiny, to see that the script runs; its timings mean nothing.
+    """
+
+    out: Path | None = None
+    repeats: int = 5
+    quick: bool = False
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of one run of something, an entry per repeat, and the seconds it took to compile."""
+
+    seconds: tuple[float, ...]
+    compile_seconds: float
+
+    @property
+    def median(self) -> float:
+        """Median over the repeats."""
+        return statistics.median(self.seconds)
+
+    def per(self, count: float) -> Timing:
+        """The same per one of `count` things done in a run."""
+        return dataclasses.replace(self, seconds=tuple(s / count for s in self.seconds))
+
+    def cell(self, unit: float = 1e-3) -> str:
+        """Median and range in multiples of `unit` seconds, for a table."""
+        median, low, high = (number(s / unit) for s in (self.median, min(self.seconds), max(self.seconds)))
+        return f"{median} ({low} to {high})"
+
+
+class Problem(NamedTuple):
+    """The task that everything is measured on, and a preset for it."""
+
+    space: envs.BenchmarkSpace
+    target: Any
+    config: Config
+    hparams: HParams
+
+
+def load_problem(preset: str, **changes: Any) -> Problem:
+    """A preset with some fields of its config changed."""
+    config, hparams = PRESETS[preset]
+    return Problem(envs.make(SPACE), envs.load_target(SPACE, TARGET), dataclasses.replace(config, **changes), hparams)
+
+
+def check(options: Options) -> None:
+    """Raises a `UsageError` for options that cannot be."""
+    if options.repeats < 1:
+        raise UsageError(f"--repeats must be at least 1, got {options.repeats}")
+
+
+def pin(cores: int) -> None:
+    """Keeps this process and the threads it will start on `cores` cores; call before JAX starts its backend.
+
+    Raises:
+      UsageError: there are fewer, or the system cannot pin.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        raise UsageError("pinning to cores needs Linux")
+    allowed = sorted(os.sched_getaffinity(0))
+    if not 1 <= cores <= len(allowed):
+        raise UsageError(f"--cores must be between 1 and the {len(allowed)} this process may use, got {cores}")
+    os.sched_setaffinity(0, allowed[:cores])
+
+
+def time_loop(step: Callable[[C, F], C], carry: C, fixed: F, *, repeats: int, at_least: float) -> Timing:
+    """Times `carry = step(carry, fixed)` in a compiled loop of as many runs as take `at_least` seconds.
+
+    `carry` is copied, because the loop donates it.  `fixed` is an argument of the program, never a constant that the compiler
+    could compute with.
+    """
+
+    def loop(carry: C, fixed: F, length: Any) -> C:
+        return jax.lax.fori_loop(0, length, lambda _, c: step(c, fixed), carry)
+
+    carry = jax.tree.map(jnp.copy, carry)
+    compiled, compile_seconds = compile_ahead(jax.jit(loop, donate_argnums=0), carry, fixed, np.int32(1))
+
+    def run(length: int) -> float:
+        nonlocal carry
+        began = time.perf_counter()
+        carry = jax.block_until_ready(compiled(carry, fixed, np.int32(length)))
+        return time.perf_counter() - began
+
+    run(1)
+    length = 1
+    while (seconds := run(length)) < at_least:
+        length = int(length * min(max(1.2 * at_least / seconds, 1.5), 16.0)) + 1
+    return Timing(tuple(run(length) / length for _ in range(repeats)), compile_seconds)
+
+
+def time_calls(
+    function: Callable[..., tuple[Any, ...]], carry: tuple[Any, ...], fixed: Any, *, repeats: int
+) -> tuple[Timing, tuple[Any, ...]]:
+    """Times `(*carry, output) = function(*carry, fixed)`, jitted with its first argument donated (after a copy).
+
+    Returns:
+      The times without the first call, which nothing is warm for, and the carry after all calls.
+    """
+    carry = jax.tree.map(jnp.copy, carry)
+    compiled, compile_seconds = compile_ahead(jax.jit(function, donate_argnums=0), *carry, fixed)
+
+    def run() -> float:
+        nonlocal carry
+        began = time.perf_counter()
+        *after, output = compiled(*carry, fixed)
+        jax.block_until_ready((after, output))
+        carry = tuple(after)
+        return time.perf_counter() - began
+
+    run()
+    return Timing(tuple(run() for _ in range(repeats)), compile_seconds), carry
+
+
+def compile_ahead(function: Callable[..., Any], *args: Any) -> tuple[Callable[..., Any], float]:
+    """A jitted function compiled for some arguments, and the seconds that took."""
+    began = time.perf_counter()
+    compiled = cast(jax.stages.Wrapped, function).lower(*args).compile()
+    return compiled, time.perf_counter() - began
+
+
+def in_new_process(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+    """Calls a module's function in a Python process of its own, because JAX is set up once per process."""
+    with ProcessPoolExecutor(max_workers=1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *args, **kwargs).result()
+
+
+def peak_memory() -> int:
+    """Largest resident size of this process so far, in bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def number(value: float) -> str:
+    """Three significant digits, never in exponential form."""
+    return f"{float(f'{value:.3g}'):,.12g}"
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; every column but the first is aligned to the right."""
+    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+
+def report(name: str, options: Options, results: Mapping[str, Any], text: str) -> None:
+    """Prints the tables and writes the raw numbers with all that is needed to read them."""
+    environment = {**runtime.describe(), "cpu": _cpu_model(), "cores": os.cpu_count(), "load_average": _LOAD_AVERAGE}
+    settings = {key: value for key, value in dataclasses.asdict(options).items() if key != "out"}
+    content = {"benchmark": name, "settings": settings, "environment": environment, "results": results}
+    path = options.out or Path("runs") / "benchmarks" / f"{name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=1, default=dataclasses.asdict) + "\n")
+    print(f"{text}\n{_caption(environment)}\nRaw numbers: {path}")
+
+
+def _caption(environment: Mapping[str, Any]) -> str:
+    """The machine and the versions in one line."""
+    packages = environment["packages"]
+    versions = ", ".join(f"{name} {packages[name]}" for name in ("jax", "jaxlib", "flax", "optax", "numpy"))
+    return f"{environment['cpu']}, {environment['cores']} cores, {environment['device_kind']}; {versions}."
+
+
+def _cpu_model() -> str:
+    """The processor's name as the system gives it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

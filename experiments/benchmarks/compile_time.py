@@ -1,0 +1,119 @@
+"""How long a run takes to get going: `python -m experiments.benchmarks.compile_time`.
+
+Each start is a new process, with a compilation cache that is empty ("cold") or that the start before has filled ("warm").
+"""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import jax
+import tyro
+
+from apt_jax.lanes import make_program, stack_hparams
+from apt_jax.trainer import Clock, make_trainer
+from experiments import runtime
+from experiments.benchmarks import _measure
+from experiments.benchmarks._measure import Options
+from experiments.errors import exit_with
+
+
+@dataclass(frozen=True)
+class Args(Options):
+    """Time the start of a training run.
+
+    Attributes:
+      preset: what is trained.
+      seeds: seeds in the program, one after another on each device.
+      cores: cores that the process may use.
+    """
+
+    repeats: int = 3
+    preset: Literal["paper", "fast"] = "fast"
+    seeds: int = 1
+    cores: int = 2
+
+
+@dataclass(frozen=True)
+class Start:
+    """Seconds, each counted on its own but for the last.
+
+    Attributes:
+      imports: from the request for a process to the benchmark's first line in it.
+      init: to trace, lower and compile `Program.init`, or to load it from the cache.
+      warmup: the same for `Program.warmup`.
+      chunk: the same for `Program.chunk`.
+      first_chunk: from the request for a process to the end of the first chunk, the steps before any update included.
+      peak_memory: largest resident size of the process, in bytes.
+    """
+
+    imports: float
+    init: float
+    warmup: float
+    chunk: float
+    first_chunk: float
+    peak_memory: int
+
+
+def main() -> int:
+    """The command line."""
+    args = tyro.cli(Args, prog="python -m experiments.benchmarks.compile_time")
+    _measure.check(args)
+    starts: dict[str, list[Start]] = {"cold": [], "warm": []}
+    for _ in range(1 if args.quick else args.repeats):
+        with tempfile.TemporaryDirectory() as cache:
+            for kind in starts:
+                starts[kind].append(_measure.in_new_process(start, Path(cache), args, requested=time.time()))
+    columns: dict[str, Callable[[Start], float]] = {
+        "process and imports, s": lambda s: s.imports,
+        "init, s": lambda s: s.init,
+        "warmup, s": lambda s: s.warmup,
+        "chunk, s": lambda s: s.chunk,
+        "first chunk done after, s": lambda s: s.first_chunk,
+        "peak memory, MiB": lambda s: s.peak_memory / 2**20,
+    }
+    rows = [[kind, *(_cell([column(s) for s in group]) for column in columns.values())] for kind, group in starts.items()]
+    _measure.report("compile_time", args, dict(starts), _measure.table(["cache", *columns], rows))
+    return 0
+
+
+def start(cache: Path, args: Args, *, requested: float) -> Start:
+    """Begins a run in this process; `requested` is the time at which it was asked for."""
+    imports = time.time() - requested
+    _measure.pin(args.cores)
+    runtime.setup()
+    jax.config.update("jax_compilation_cache_dir", str(cache))
+    space, target, config, one = _measure.load_problem(args.preset)
+    program = make_program(make_trainer(space, target, config), args.seeds)
+    hparams = stack_hparams([one] * args.seeds)
+
+    keys = jax.random.split(jax.random.key(0), args.seeds)
+    init, init_seconds = _measure.compile_ahead(program.init, keys, hparams)
+    states, clock = init(keys, hparams), Clock.start()
+    warmup, warmup_seconds = _measure.compile_ahead(program.warmup, states, clock, hparams)
+    states, clock = warmup(states, clock, hparams)
+    chunk, chunk_seconds = _measure.compile_ahead(program.chunk, states, clock, hparams)
+    jax.block_until_ready(chunk(states, clock, hparams))
+    return Start(
+        imports=imports,
+        init=init_seconds,
+        warmup=warmup_seconds,
+        chunk=chunk_seconds,
+        first_chunk=time.time() - requested,
+        peak_memory=_measure.peak_memory(),
+    )
+
+
+def _cell(values: list[float]) -> str:
+    median, low, high = (_measure.number(value) for value in (statistics.median(values), min(values), max(values)))
+    return f"{median} ({low} to {high})"
+
+
+if __name__ == "__main__":
+    exit_with(main)

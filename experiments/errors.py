@@ -1,0 +1,20 @@
+"""Mistakes of the user, told in one line instead of a traceback."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+
+class UsageError(Exception):
+    """A request that cannot be fulfilled as given; the message says why and what would be."""
+
+
+def exit_with(main: Callable[[], int]) -> None:
+    """Ends the process with the exit code of `main`, or with 2 and one line on a `UsageError`."""
+    try:
+        code = main()
+    except UsageError as error:
+        print(f"error: {error}", file=sys.stderr)
+        code = 2
+    sys.exit(code)

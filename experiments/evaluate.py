@@ -1,0 +1,86 @@
+"""Score the policies of a run on any target of its space: `python -m experiments.evaluate --run-dir DIR --target B`."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+import tyro
+from jax.sharding import SingleDeviceSharding
+from rich.console import Console
+from rich.table import Table
+
+import envs.rendering
+from apt_jax.evaluation import Outcome
+from apt_jax.lanes import stack_hparams
+from experiments import episodes, runtime, settings
+from experiments.errors import UsageError, exit_with
+from experiments.problem import make_problem
+from experiments.run_dir import RunDir
+from experiments.runner import lane_keys, load_states
+
+
+@dataclass(frozen=True)
+class Args:
+    """Score the policies of a run on any target of its space.
+
+    Attributes:
+      run_dir: a directory that experiments.train wrote.
+      target: a target's name, by default the one trained on.
+      target_file: a file that describes the target task, instead of a name.
+      episodes: greedy episodes per seed.
+      seed: of the episodes' initial states.
+      gif: where to put a film of the best seed.
+    """
+
+    run_dir: Path
+    target: str | None = None
+    target_file: Path | None = None
+    episodes: int = 50
+    seed: int = 0
+    gif: Path | None = None
+
+
+def main() -> int:
+    """The command line."""
+    args = tyro.cli(Args, prog="python -m experiments.evaluate")
+    runtime.setup()
+    evaluate(args)
+    return 0
+
+
+def evaluate(args: Args) -> None:
+    """Prints return and success of every seed."""
+    if args.episodes < 1:
+        raise UsageError(f"--episodes must be at least 1, got {args.episodes}")
+    experiment = settings.load(args.run_dir)
+    if args.target or args.target_file:
+        experiment = dataclasses.replace(experiment, target=args.target or experiment.target, target_file=args.target_file)
+    problem = make_problem(experiment)
+    keys, hparams = lane_keys(experiment.seeds), stack_hparams([experiment.hparams] * len(experiment.seeds))
+    here = SingleDeviceSharding(jax.devices()[0])
+    states, clock = load_states(RunDir(args.run_dir).checkpoints, problem.trainer, keys, hparams, here)
+    policies = states.learner.params
+    key_score, key_film = jax.random.split(jax.random.key(args.seed))
+    outcome = episodes.score(problem.trainer, policies, problem.target, episodes=args.episodes, key=key_score)
+    _print(experiment.seeds, outcome, f"{settings.target_name(experiment)} after {int(clock.env_steps):,} steps")
+    if args.gif:
+        best = int(np.argmax(outcome.episode_return.mean(axis=1)))
+        policy = jax.tree.map(lambda x: x[best], policies)
+        envs.rendering.save_gif(args.gif, episodes.film(problem.space, problem.trainer, policy, problem.target, key_film))
+
+
+def _print(seeds: tuple[int, ...], outcome: Outcome, title: str) -> None:
+    table = Table("seed", "return", "success", "steps", title=title)
+    for seed, *values in zip(seeds, outcome.episode_return, outcome.success, outcome.length, strict=True):
+        table.add_row(str(seed), *(f"{np.mean(value):.3f}" for value in values))
+    table.add_section()
+    table.add_row("mean", *(f"{np.mean(values):.3f}" for values in outcome))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    exit_with(main)

@@ -1,0 +1,64 @@
+"""Every picture of a run directory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import envs.rendering
+from experiments import episodes, plots, run_dir
+from experiments.problem import Problem
+from experiments.settings import Experiment, target_name
+
+_COLUMNS, _ROWS = 6, 5
+"""Steps and seeds in the picture of the progression, at most."""
+
+
+def draw(path: Path, experiment: Experiment, problem: Problem, policies: Any) -> None:
+    """Learning curves, progression of generated tasks, and the best seed's policy (leaves [L, ...]) on the target."""
+    draw_curves(path, experiment)
+    if run_dir.task_files(path):
+        draw_progression(path, experiment, problem)
+    draw_policy(path, experiment, problem, policies)
+
+
+def draw_curves(path: Path, experiment: Experiment) -> None:
+    """learning_curves.png."""
+    env_steps, curves = run_dir.read_metrics(path)
+    plots.learning_curves(
+        path / "learning_curves.png",
+        env_steps,
+        curves,
+        seeds=experiment.seeds,
+        delta=float(experiment.hparams.delta),
+        title=f"{experiment.config.method} on {experiment.space}, target {target_name(experiment)}",
+    )
+
+
+def draw_progression(path: Path, experiment: Experiment, problem: Problem) -> None:
+    """progression.png: the first sampled task of each seed over time."""
+    files = run_dir.task_files(path)
+    instantiate = jax.jit(problem.space.instantiate)
+    lanes = range(min(_ROWS, len(experiment.seeds)))
+    boards = {}
+    for step in plots.evenly(list(files), at_most=_COLUMNS):
+        with np.load(files[step]) as w:
+            boards[step] = [problem.space.render(instantiate({name: w[name][lane, 0] for name in w})) for lane in lanes]
+    plots.progression(
+        path / "progression.png",
+        boards,
+        problem.space.render(problem.target),
+        rows=[f"seed {experiment.seeds[lane]}" for lane in lanes],
+    )
+
+
+def draw_policy(path: Path, experiment: Experiment, problem: Problem, policies: Any) -> None:
+    """policy.gif: the seed with the best final return on the target."""
+    _, curves = run_dir.read_metrics(path)
+    best = int(np.argmax(curves["target_return"][:, -1]))
+    policy = jax.tree.map(lambda x: x[best], policies)
+    frames = episodes.film(problem.space, problem.trainer, policy, problem.target, jax.random.key(experiment.seeds[best]))
+    envs.rendering.save_gif(path / "policy.gif", frames)

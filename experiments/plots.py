@@ -1,0 +1,108 @@
+"""Pictures of a run, drawn from its files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int, UInt8
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.run_dir import Curves
+
+Image = UInt8[np.ndarray, "H W 3"]
+
+PANELS = {
+    "target_return": "Return on the target",
+    "generated_episode_return": "Return on generated tasks",
+    "beta": "Beta",
+    "probe_solution_length": "Shortest solution of generated tasks",
+}
+"""The metrics drawn, as far as a method and a task space have them."""
+
+_MEAN_COLOUR = "black"
+_TARGET_COLOUR = "tab:green"
+
+
+def learning_curves(
+    file: Path, env_steps: Int[np.ndarray, "T"], curves: Curves, *, seeds: Sequence[int], delta: float, title: str
+) -> None:
+    """One panel per metric: every seed thin, their mean thick; `delta` is the generated return that beta steers to."""
+    names = [name for name in PANELS if name in curves]
+    figure = Figure(figsize=(4.2 * len(names), 3.6), layout="constrained")
+    for axes, name in zip(np.atleast_1d(figure.subplots(1, len(names))), names, strict=True):
+        for seed, values in zip(seeds, curves[name], strict=True):
+            axes.plot(env_steps, values, marker=".", markersize=3, linewidth=1, alpha=0.6, label=f"seed {seed}")
+        mean = np.ma.masked_invalid(curves[name]).mean(axis=0)
+        axes.plot(env_steps, mean, color=_MEAN_COLOUR, linewidth=2, label="mean")
+        _decorate(axes, name)
+        if name == "generated_episode_return" and "beta" in curves:
+            _mark(axes, delta, "delta")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=8, fontsize="small")
+    figure.suptitle(title)
+    figure.savefig(file, dpi=150)
+
+
+def _decorate(axes: Axes, name: str) -> None:
+    axes.set_title(PANELS[name], fontsize="medium")
+    axes.set_xlabel("environment steps")
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k")
+    axes.grid(alpha=0.3)
+    if name == "beta":
+        axes.set_yscale("log", base=2)
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    if name.endswith("return"):  # at least from 0 to 1, so that noise around failure looks like noise
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, 0.0), max(high, 1.0))
+
+
+def _mark(axes: Axes, level: float, text: str) -> None:
+    axes.axhline(level, color=_TARGET_COLOUR, linestyle="--", linewidth=1)
+    axes.annotate(text, (0.99, level), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize="small")
+
+
+def progression(file: Path, boards: Mapping[int, Sequence[Image]], target: Image, *, rows: Sequence[str]) -> None:
+    """Generated tasks over time, the target last with a green border.
+
+    Args:
+      boards: by environment step, one picture per row.
+      rows: titles of the rows.
+    """
+    figure = Figure(figsize=(1.7 * (len(boards) + 1), 1.6 * len(rows) + 0.3), layout="constrained")
+    grid = figure.subplots(len(rows), len(boards) + 1, squeeze=False)
+    for column, (env_steps, pictures) in enumerate(boards.items()):
+        grid[0, column].set_title(f"{env_steps:,} steps", fontsize="small")
+        for axes, picture in zip(grid[:, column], pictures, strict=True):
+            _show(axes, picture)
+    grid[0, -1].set_title("target", fontsize="small", color=_TARGET_COLOUR)
+    for axes, title in zip(grid[:, 0], rows, strict=True):
+        axes.set_ylabel(title, fontsize="small")
+    for axes in grid[:, -1]:
+        _show(axes, target)
+        for spine in axes.spines.values():
+            spine.set(color=_TARGET_COLOUR, linewidth=3, visible=True)
+    figure.savefig(file, dpi=150)
+
+
+def gallery(file: Path, pictures: Sequence[Image], *, columns: int) -> None:
+    """Pictures in rows of `columns`."""
+    rows = -(-len(pictures) // columns)
+    figure = Figure(figsize=(1.6 * columns, 1.6 * rows), layout="constrained")
+    for axes, picture in zip(figure.subplots(rows, columns, squeeze=False).flat, pictures, strict=False):
+        _show(axes, picture)
+    figure.savefig(file, dpi=150)
+
+
+def _show(axes: Axes, picture: Image) -> None:
+    axes.imshow(picture)
+    axes.set(xticks=[], yticks=[])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def evenly(steps: Sequence[int], at_most: int) -> list[int]:
+    """At most so many of the steps, evenly spread, first and last among them."""
+    chosen = np.unique(np.linspace(0, len(steps) - 1, min(at_most, len(steps))).round().astype(int))
+    return [steps[i] for i in chosen]

@@ -1,0 +1,51 @@
+"""From an experiment's names to the objects they stand for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import envs
+from apt_jax.config import Config
+from apt_jax.trainer import Trainer, make_trainer
+from experiments.errors import UsageError
+from experiments.settings import Experiment
+
+
+class Problem(NamedTuple):
+    """A task space, a target task of it, and the trainer for both."""
+
+    space: envs.BenchmarkSpace
+    target: Any
+    trainer: Trainer
+
+
+def load_target(space: str, name: str, file: Path | None) -> Any:
+    """The target task of a file, if one is given, else of a name; raises a `UsageError` if there is none."""
+    try:
+        return envs.load_target_file(space, file) if file else envs.load_target(space, name)
+    except (ValueError, OSError) as error:
+        raise UsageError(str(error)) from error
+
+
+def make_problem(experiment: Experiment) -> Problem:
+    """Checks every name and size before anything is compiled; raises a `UsageError`."""
+    target = load_target(experiment.space, experiment.target, experiment.target_file)
+    space = envs.make(experiment.space)
+    try:
+        problem = Problem(space, target, make_trainer(space, target, experiment.config))
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    check_env_steps(experiment.env_steps, experiment.config)
+    return problem
+
+
+def check_env_steps(env_steps: int, config: Config) -> None:
+    """Raises a `UsageError` unless warm-up and a whole number of chunks make up `env_steps`."""
+    chunks = max(round((env_steps - config.warmup_steps) / config.eval_every), 1)
+    closest = config.warmup_steps + chunks * config.eval_every
+    if env_steps != closest:
+        raise UsageError(
+            f"--env-steps must exceed warmup_steps ({config.warmup_steps}) by a multiple of eval_every ({config.eval_every}); "
+            f"closest to {env_steps} is {closest}"
+        )

@@ -1,0 +1,145 @@
+"""The files of one run.
+
+* config.json: the experiment, enough to resume it
+* metrics.csv: one row per seed and evaluation
+* summary.json: results, times, versions
+* checkpoints/: the latest state (orbax)
+* tasks/: generated task parameters over time, one npz per sampled step, leaves [seeds, tasks, ...]
+* pictures
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from apt_jax.specs import Params
+from experiments.errors import UsageError
+
+Curves = dict[str, Float[np.ndarray, "S T"]]
+"""Metrics by name: one row per seed, one column per evaluation."""
+
+_INDEX = ("seed", "env_steps", "wall_seconds")
+
+
+class RunDir:
+    """A run directory that this process writes to."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    @classmethod
+    def create(cls, path: Path, config: Mapping[str, Any], target_file: Path | None) -> RunDir:
+        """A new run; `target_file` is copied in, so that the directory stands alone.
+
+        Raises:
+          UsageError: the directory holds something already.
+        """
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise UsageError(f"{path} is not empty; pass --resume to go on with the run in it, or another --run-dir")
+        path.mkdir(parents=True, exist_ok=True)
+        if target_file:
+            shutil.copyfile(target_file, path / f"target{target_file.suffix}")
+            config = {**config, "target_file": f"target{target_file.suffix}"}
+        run = cls(path)
+        run.write_json("config.json", config)
+        return run
+
+    @property
+    def checkpoints(self) -> Path:
+        """Where `apt_jax.checkpoint` writes."""
+        return self.path / "checkpoints"
+
+    def rewind(self, env_steps: int) -> None:
+        """Drops what was written after a checkpoint's step, so that a resumed run writes it once."""
+        rows = [row for row in _read_rows(self.path) if int(row["env_steps"]) <= env_steps]
+        metrics = self.path / "metrics.csv"
+        if rows:
+            _write_rows(metrics.with_suffix(".tmp"), rows, mode="w")
+            metrics.with_suffix(".tmp").replace(metrics)
+        else:
+            metrics.unlink(missing_ok=True)
+        for step, file in task_files(self.path).items():
+            if step > env_steps:
+                file.unlink()
+
+    def append_metrics(
+        self, env_steps: int, wall_seconds: float, seeds: Sequence[int], metrics: Mapping[str, Float[np.ndarray, "S"]]
+    ) -> None:
+        """One row per seed."""
+        rows = [
+            dict(zip(_INDEX, (seed, env_steps, f"{wall_seconds:.2f}"), strict=True))
+            | {name: str(values[lane]) for name, values in sorted(metrics.items())}
+            for lane, seed in enumerate(seeds)
+        ]
+        _write_rows(self.path / "metrics.csv", rows, mode="a")
+
+    def write_tasks(self, env_steps: int, w: Params) -> None:
+        """Generated task parameters, leaves [seeds, tasks, ...]."""
+        (self.path / "tasks").mkdir(exist_ok=True)
+        arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in w.items()}
+        np.savez_compressed(self.path / "tasks" / f"{env_steps:010d}.npz", **arrays)
+
+    def write_json(self, name: str, content: Mapping[str, Any]) -> None:
+        """Writes a JSON file whole or not at all."""
+        temporary = self.path / f"{name}.tmp"
+        temporary.write_text(json.dumps(content, indent=2, default=str) + "\n")
+        temporary.replace(self.path / name)
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """The content of config.json.
+
+    Raises:
+      UsageError: no run in that directory.
+    """
+    file = path / "config.json"
+    if not file.is_file():
+        raise UsageError(f"{path} holds no run (no config.json)")
+    content: dict[str, Any] = json.loads(file.read_text())
+    return content
+
+
+def read_metrics(path: Path) -> tuple[Int[np.ndarray, "T"], Curves]:
+    """The environment steps of every evaluation, and the metrics with `wall_seconds`."""
+    rows = _read_rows(path)
+    seeds = len({row["seed"] for row in rows})
+    columns = {name: np.array([float(row[name]) for row in rows]).reshape(-1, seeds).T for name in rows[0]}
+    return columns.pop("env_steps")[0].astype(int), columns
+
+
+def wall_seconds(path: Path) -> float:
+    """How long the run took until its last evaluation."""
+    rows = _read_rows(path)
+    return float(rows[-1]["wall_seconds"]) if rows else 0.0
+
+
+def task_files(path: Path) -> dict[int, Path]:
+    """Sampled task parameters by environment step, in order."""
+    return {int(file.stem): file for file in sorted((path / "tasks").glob("*.npz"))}
+
+
+def _read_rows(path: Path) -> list[dict[str, str]]:
+    file = path / "metrics.csv"
+    if not file.exists():
+        return []
+    with file.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def _write_rows(file: Path, rows: Sequence[Mapping[str, object]], mode: str) -> None:
+    with file.open(mode, newline="") as stream:
+        writer = csv.DictWriter(stream, fieldnames=list(rows[0]))
+        if stream.tell() == 0:
+            writer.writeheader()
+        writer.writerows(rows)
+        stream.flush()
+        os.fsync(stream.fileno())

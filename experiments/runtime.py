@@ -1,0 +1,62 @@
+"""What has to be set before JAX starts its backend, and what a run records about it."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from importlib import metadata
+from pathlib import Path
+
+import jax
+
+_PACKAGES = ("apt-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+_MIN_COMPILE_SECONDS = 1.0
+"""Programs that compile faster are not worth a file in the cache."""
+
+
+def setup(cpu_devices: int | None = None) -> None:
+    """Splits the CPU into devices and turns the persistent compilation cache on; call before the first array.
+
+    Args:
+      cpu_devices: devices the host CPU counts as, by default one per core this process may use.
+    """
+    jax.config.update("jax_num_cpu_devices", cpu_devices or _cores())
+    if not jax.config.values["jax_compilation_cache_dir"]:  # JAX itself reads JAX_COMPILATION_CACHE_DIR
+        jax.config.update("jax_compilation_cache_dir", str(_cache_root() / "apt_jax" / "compiled"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _MIN_COMPILE_SECONDS)
+
+
+def describe() -> dict[str, object]:
+    """Versions, device and commit, for a run's summary."""
+    devices = jax.devices()
+    return {
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in _PACKAGES},
+        "device_kind": devices[0].device_kind,
+        "devices": len(devices),
+        "git_commit": _git_commit(),
+    }
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _cache_root() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:  # run from a checkout that is not installed
+        return None
+
+
+def _git_commit() -> str | None:
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):  # no git, or not a checkout
+        return None

@@ -1,0 +1,183 @@
+"""What a training run is asked to do: the command line, and the part of it that a run directory remembers."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from apt_jax.config import PRESETS, Config, HParams
+from apt_jax.lanes import Layout
+from experiments import run_dir
+from experiments.errors import UsageError
+
+Preset = Literal["paper", "fast"]
+SinkName = Literal["tensorboard", "wandb"]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What is computed; saved in the run directory, and what a resumed run has to agree with.
+
+    Attributes:
+      space: the task space.
+      target: the target task's name in the space.
+      target_file: a file that describes the target task, instead of a name.
+      seeds: one lane of the compiled program each.
+      env_steps: environment steps of all sources together, warm-up included.
+      config: sizes and names; a change compiles a new program.
+      hparams: numbers.
+    """
+
+    space: str = "grid_world"
+    target: str = "A"
+    target_file: Path | None = None
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    env_steps: int = 100_000
+    config: Config = dataclasses.field(default_factory=Config)
+    hparams: HParams = dataclasses.field(default_factory=HParams)
+
+
+@dataclass(frozen=True)
+class Session:
+    """How it is computed; may differ when a run is resumed.
+
+    Attributes:
+      run_dir: where everything is written; must be new, empty, or resumed.
+      resume: go on from the run directory's checkpoint; the experiment defaults to what is saved there.
+      preset: the config and hparams to start from (paper, unless a run is resumed); other options override single fields.
+      method: short for --config.method.
+      layout: how the seeds of one device are laid out.
+      devices: devices the host CPU counts as, by default one per core; seeds are spread over them.
+      sinks: also log there.
+      checkpoint_every: environment steps between checkpoints.
+    """
+
+    run_dir: Path
+    resume: bool = False
+    preset: Preset | None = None
+    method: str | None = None
+    layout: Layout = "auto"
+    devices: int | None = None
+    sinks: tuple[SinkName, ...] = ()
+    checkpoint_every: int = 10_000
+
+    @property
+    def resume_command(self) -> str:
+        """What to type to go on in the same way; the experiment itself is in the run directory."""
+        words = ["python", "-m", "experiments.train", "--run-dir", str(self.run_dir), "--resume"]
+        default = Session(self.run_dir)
+        for name in ("layout", "devices", "sinks", "checkpoint_every"):
+            value = getattr(self, name)
+            if value != getattr(default, name):
+                words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else [value])]
+        return shlex.join(words)
+
+
+@dataclass(frozen=True)
+class _Basis:
+    """The options that decide the defaults of all others."""
+
+    run_dir: Path | None = None
+    resume: bool = False
+    preset: Preset | None = None
+
+
+def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
+    """The command line; each option's default is the saved run's when resuming, else the preset's.
+
+    Raises:
+      UsageError: options that contradict each other or the saved run.
+    """
+    args = sys.argv[1:] if args is None else list(args)
+    basis, _ = tyro.cli(_Basis, args=args, add_help=False, return_unknown_args=True)
+    saved = load(basis.run_dir) if basis.resume and basis.run_dir else None
+    default = saved or Experiment()
+    if basis.preset or not saved:
+        config, hparams = PRESETS[basis.preset or "paper"]
+        default = dataclasses.replace(default, config=config, hparams=hparams)
+
+    def train(
+        session: Annotated[Session, tyro.conf.arg(name="")],
+        experiment: Annotated[Experiment, tyro.conf.arg(name="")] = default,
+    ) -> tuple[Experiment, Session]:
+        """Train a curriculum on one target task, all seeds in one compiled program."""
+        return experiment, session
+
+    experiment, session = tyro.cli(train, args=args, prog="python -m experiments.train", config=(tyro.conf.FlagCreatePairsOff,))
+    if session.method:
+        experiment = dataclasses.replace(experiment, config=dataclasses.replace(experiment.config, method=session.method))
+    check(experiment, session)
+    if saved:
+        check_resumable(saved, experiment)
+    return experiment, session
+
+
+def check(experiment: Experiment, session: Session) -> None:
+    """Raises a `UsageError` for what can be told wrong without the task space."""
+    if not experiment.seeds or len(set(experiment.seeds)) != len(experiment.seeds):
+        raise UsageError(f"--seeds needs one or more different numbers, got {' '.join(map(str, experiment.seeds)) or 'none'}")
+    if min(experiment.seeds) < 0:
+        raise UsageError(f"--seeds must not be negative, got {min(experiment.seeds)}")
+    if experiment.target_file and not experiment.target_file.is_file():
+        raise UsageError(f"--target-file {experiment.target_file} is no file")
+    for name in ("devices", "checkpoint_every"):
+        value = getattr(session, name)
+        if value is not None and value < 1:
+            raise UsageError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
+
+
+def check_resumable(saved: Experiment, asked: Experiment) -> None:
+    """Raises a `UsageError` that names every difference; only `env_steps` may grow."""
+    if asked.env_steps < saved.env_steps:
+        raise UsageError(f"--env-steps may only grow on --resume: saved {saved.env_steps}, asked {asked.env_steps}")
+    old, new = _comparable(saved), _comparable(asked)
+    differing = [f"{name} (saved {old[name]}, asked {new[name]})" for name in old if old[name] != new[name]]
+    if differing:
+        raise UsageError(f"--resume must keep what the run was started with; it differs in {', '.join(differing)}")
+
+
+def load(directory: Path) -> Experiment:
+    """The experiment of a run directory.
+
+    Raises:
+      UsageError: no run there, or one that this version cannot read.
+    """
+    saved = run_dir.read_config(directory)
+    try:
+        return Experiment(
+            **{
+                **saved,
+                "target_file": directory / saved["target_file"] if saved["target_file"] else None,
+                "seeds": tuple(saved["seeds"]),
+                "config": Config(**saved["config"]),
+                "hparams": HParams(**saved["hparams"]),
+            }
+        )
+    except (KeyError, TypeError) as error:
+        raise UsageError(f"{directory} was written by another version: {error}") from error
+
+
+def target_name(experiment: Experiment) -> str:
+    """What to call the target in a title."""
+    return experiment.target_file.name if experiment.target_file else experiment.target
+
+
+def _comparable(experiment: Experiment) -> dict[str, Any]:
+    """Every field under its option's name, the target file by its content; without `env_steps`."""
+    fields = dataclasses.asdict(experiment)
+    del fields["env_steps"]
+    config, hparams = fields.pop("config"), fields.pop("hparams")
+    if experiment.target_file:
+        fields["target_file"] = experiment.target_file.read_text()
+    return {
+        **fields,
+        **{f"config.{name}": value for name, value in config.items()},
+        **{f"hparams.{name}": value for name, value in hparams.items()},
+    }

@@ -1,0 +1,151 @@
+"""Train one method on one target task, all seeds at once: `python -m experiments.train --run-dir DIR`.
+
+Interrupt it with Ctrl-C or SIGTERM at any time: it finishes the chunk at hand, saves, and says how to go on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from typing import TypeVar
+
+from apt_jax import checkpoint
+from experiments import pictures, run_dir, runtime
+from experiments.errors import exit_with
+from experiments.interrupt import EXIT_CODE, Interrupt
+from experiments.problem import make_problem
+from experiments.progress import View, make_view
+from experiments.run_dir import RunDir
+from experiments.runner import Runner
+from experiments.settings import Experiment, Session, parse
+from experiments.sinks import Sink, check_installed, make_sinks
+from experiments.summary import Times, is_complete, summarise
+
+T = TypeVar("T")
+
+TASKS_PER_SEED = 8
+TASKS_EVERY = 5
+"""Chunks between samples of generated tasks."""
+
+
+def main() -> int:
+    """The command line."""
+    experiment, session = parse()
+    runtime.setup(session.devices)
+    return train(experiment, session)
+
+
+def train(experiment: Experiment, session: Session) -> int:
+    """Trains until `experiment.env_steps` or an interrupt; returns the exit code."""
+    problem = make_problem(experiment)
+    check_installed(session.sinks)
+    run = open_run(experiment, session)
+    if is_complete(run.path, experiment):
+        print(f"{run.path} has all its {experiment.env_steps:,} steps; pass a larger --env-steps to go on")
+        return 0
+    with Interrupt() as interrupt, make_view(experiment.seeds, experiment.env_steps) as view, ExitStack() as stack:
+        view.note(
+            f"{experiment.config.method} on {experiment.space}, seeds {' '.join(map(str, experiment.seeds))}, into {run.path}"
+        )
+        sinks = [stack.enter_context(closing(sink)) for sink in open_sinks(experiment, session, run)]
+        times = Times(before=run_dir.wall_seconds(run.path))
+        runner = Runner(problem.trainer, experiment, session.layout)
+        Training(experiment, session, runner, run, view, sinks, interrupt, times).run()
+        view.stop()
+        if run_dir.wall_seconds(run.path):
+            pictures.draw(run.path, experiment, problem, runner.policies)
+            run.write_json("summary.json", summarise(run.path, experiment, times))
+        if runner.env_steps < experiment.env_steps:
+            view.note(f"stopped at {runner.env_steps:,} steps; to go on: {session.resume_command}")
+            return EXIT_CODE
+        view.note(f"finished {runner.env_steps:,} steps after {times.wall:.0f} s: {run.path}")
+        return 0
+
+
+def open_sinks(experiment: Experiment, session: Session, run: RunDir) -> list[Sink]:
+    """The sinks asked for, which go on where the run does."""
+    start = checkpoint.latest_step(run.checkpoints) or 0
+    return make_sinks(session.sinks, run.path, start=start, seeds=experiment.seeds, config=dataclasses.asdict(experiment))
+
+
+def open_run(experiment: Experiment, session: Session) -> RunDir:
+    """A new run directory, or the one to resume, as it was at its checkpoint."""
+    config = dataclasses.asdict(experiment)
+    if not session.resume:
+        return RunDir.create(session.run_dir, config, experiment.target_file)
+    run = RunDir(session.run_dir)
+    run.rewind(checkpoint.latest_step(run.checkpoints) or 0)
+    run.write_json("config.json", {**config, "target_file": run_dir.read_config(run.path)["target_file"]})
+    return run
+
+
+@dataclass
+class Training:
+    """The host loop: what happens before, between and after chunks."""
+
+    experiment: Experiment
+    session: Session
+    runner: Runner
+    run_dir: RunDir
+    view: View
+    sinks: Sequence[Sink]
+    interrupt: Interrupt
+    times: Times
+
+    def run(self) -> None:
+        """From the checkpoint, or the start, to the end or an interrupt; the last chunk is always saved."""
+        self._begin()
+        going = self._unfinished()
+        while going:
+            began = time.monotonic()
+            metrics = self._patiently(self.runner.advance)
+            self.times.training += time.monotonic() - began
+            self.times.trained_steps += self.experiment.config.eval_every
+            self.run_dir.append_metrics(self.runner.env_steps, self.times.wall, self.experiment.seeds, metrics)
+            self.view.write(self.runner.env_steps, metrics)
+            for sink in self.sinks:
+                sink.write(self.runner.env_steps, metrics)
+            going = self._unfinished()  # asked once, so that an interrupt cannot slip in between saving and leaving
+            if not going or self._due(TASKS_EVERY * self.experiment.config.eval_every):
+                self._sample_tasks()
+            if not going or self._due(self.session.checkpoint_every):
+                self.runner.save(self.run_dir.checkpoints)
+
+    def _begin(self) -> None:
+        if checkpoint.latest_step(self.run_dir.checkpoints) is not None:
+            self.runner.restore(self.run_dir.checkpoints)
+            self.view.note(f"restored {self.runner.env_steps:,} steps")
+        if self._unfinished():
+            self.view.note("compiling; the result is kept for later runs")
+            self.times.compile = self._patiently(self.runner.compile)
+            self.view.note(f"compiled in {self.times.compile:.1f} s")
+        if self.runner.env_steps == 0 and self._unfinished():
+            self._patiently(self.runner.warmup)
+            self._sample_tasks()
+        self.view.start(self.runner.env_steps)
+
+    def _unfinished(self) -> bool:
+        return self.runner.env_steps < self.experiment.env_steps and not self.interrupt.requested
+
+    def _due(self, every: int) -> bool:
+        """Whether the chunk at hand reached a multiple of `every`."""
+        return self.runner.env_steps % every < self.experiment.config.eval_every
+
+    def _sample_tasks(self) -> None:
+        if self.runner.generates:
+            self.run_dir.write_tasks(self.runner.env_steps, self.runner.propose(TASKS_PER_SEED))
+
+    def _patiently(self, work: Callable[[], T]) -> T:
+        """Does long work and stays able to answer an interrupt."""
+        return self.interrupt.run(work, on_request=self._acknowledge)
+
+    def _acknowledge(self) -> None:
+        self.view.stop()
+        self.view.note("stopping after this chunk, then saving; once more to stop at once and lose what is not saved")
+
+
+if __name__ == "__main__":
+    exit_with(main)

@@ -1,0 +1,128 @@
+"""The benchmarks run and their results have the fields that readers rely on; no test depends on a timing."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tests.corridor import Corridor
+
+from apt_jax.config import Config, HParams
+from experiments.benchmarks import _flops, _measure, capacity, training_step
+
+CONFIG = Config(
+    warmup_steps=30,
+    updates_per_step=1,
+    batch_size=4,
+    replay_steps=100,
+    replay_episodes=16,
+    model_updates_per_step=0.5,
+    model_batch_size=4,
+    recent_steps=50,
+    refresh_every=4,
+    eval_every=8,
+    eval_episodes=2,
+    probe_tasks=2,
+    return_window=5,
+)
+
+
+@pytest.fixture(scope="module")
+def result():
+    problem = _measure.Problem(Corridor(), np.int32(7), CONFIG, HParams())
+    return training_step.measure(problem, training_step.Args(repeats=2, at_least=0.0), rate=1e9)
+
+
+def test_every_part_of_a_training_step_is_timed(result):
+    assert list(result.parts) == [
+        "act",
+        "propose tasks",
+        "step environments",
+        "write",
+        "sample",
+        "update policy",
+        "update models",
+        "refresh",
+        "evaluate",
+    ]
+    assert list(result.models) == ["sample rollouts", "discriminator", "values", "generator"]
+    for timing in [*result.parts.values(), *result.models.values(), result.chunk, result.model_update]:
+        assert len(timing.seconds) == 2
+        assert all(seconds >= 0 for seconds in timing.seconds)
+
+
+def test_results_of_a_training_step_are_json_and_a_table(result):
+    content = json.loads(json.dumps(result, default=dataclasses.asdict))
+    assert set(content) == {
+        "config",
+        "parts",
+        "chunk",
+        "shortest_chunk",
+        "model_update",
+        "models",
+        "policy_update",
+    }
+    text = training_step.tables("tiny", result)
+    assert "| sum of the parts |" in text
+    assert "Whole / sum of the parts:" in text
+
+
+def test_matmul_flops_count_the_runs_of_a_loop():
+    def function(x, matrix):
+        return jax.lax.scan(lambda carry, _: (carry @ matrix, None), x, length=3)[0] + jnp.tanh(x)
+
+    assert _flops.matmul_flops(function, jnp.ones((2, 5)), jnp.ones((5, 5))) == 3 * 2 * 2 * 5 * 5
+
+
+def test_matmul_flops_count_batched_and_backward_products():
+    def loss(x, y):
+        return jnp.sum(jax.vmap(jnp.dot)(x, y))
+
+    forward = 7 * 2 * 2 * 3 * 4
+    assert _flops.matmul_flops(loss, jnp.ones((7, 2, 3)), jnp.ones((7, 3, 4))) == forward
+    assert _flops.matmul_flops(jax.grad(loss, argnums=(0, 1)), jnp.ones((7, 2, 3)), jnp.ones((7, 3, 4))) == 3 * forward
+
+
+def test_time_loop_keeps_the_callers_carry():
+    carry = {"x": jnp.zeros(3), "key": jax.random.key(0)}
+    timing = _measure.time_loop(lambda c, one: c | {"x": c["x"] + one}, carry, jnp.ones(3), repeats=4, at_least=0.0)
+    assert len(timing.seconds) == 4
+    assert timing.per(2).median == timing.median / 2
+    np.testing.assert_array_equal(carry["x"], np.zeros(3))
+
+
+@pytest.mark.parametrize(("value", "text"), [(0.0, "0"), (0.012345, "0.0123"), (12.345, "12.3"), (123456.0, "123,000")])
+def test_numbers_in_tables(value, text):
+    assert _measure.number(value) == text
+
+
+def test_each_preset_fits_the_quick_sizes():
+    for preset in training_step.Args().presets:
+        _measure.load_problem(preset, **training_step.QUICK)
+
+
+def test_a_script_writes_its_numbers_and_what_they_need_to_be_read(tmp_path):
+    out = tmp_path / "new" / "capacity.json"
+    command = [sys.executable, "-m", "experiments.benchmarks.capacity", "--quick", "--out", str(out)]
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "XLA_FLAGS": "--xla_backend_optimization_level=0"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert "| 10,000 |" in done.stdout
+    content = json.loads(out.read_text())
+    assert content["benchmark"] == "capacity"
+    assert {"python", "packages", "device_kind", "cpu", "cores", "load_average", "git_commit"} <= set(content["environment"])
+    assert "out" not in content["settings"]
+    for timing in content["results"].values():
+        assert math.isfinite(sum(timing["seconds"]))
+
+
+def test_a_wrong_number_of_cores_is_a_usage_error():
+    with pytest.raises(_measure.UsageError, match="--cores"):
+        _measure.pin(0)

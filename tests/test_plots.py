@@ -1,0 +1,42 @@
+"""Pictures are drawn from plain arrays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments import plots
+
+
+def read(file: Path) -> np.ndarray:
+    with Image.open(file) as image:
+        return np.asarray(image)
+
+
+def test_learning_curves_skip_metrics_a_method_lacks(tmp_path):
+    env_steps = np.arange(1, 6) * 1000
+    one = {"target_return": np.zeros((2, 5)), "td_loss": np.ones((2, 5))}
+    gaps = np.where(env_steps > 3000, np.nan, 4.0) * np.ones((2, 1))
+    four = one | {"generated_episode_return": gaps, "beta": np.ones((2, 5)), "probe_solution_length": gaps}
+    widths = []
+    for name, curves in {"one": one, "four": four}.items():
+        file = tmp_path / f"{name}.png"
+        plots.learning_curves(file, env_steps, curves, seeds=(0, 3), delta=0.5, title=name)
+        widths.append(read(file).shape[1])
+    assert widths[1] == 4 * widths[0]
+
+
+def test_progression_and_gallery(tmp_path):
+    board = np.full((40, 40, 3), 90, np.uint8)
+    plots.progression(tmp_path / "p.png", {0: [board, board], 5000: [board, board]}, board, rows=["seed 0", "seed 1"])
+    plots.gallery(tmp_path / "g.png", [board] * 5, columns=3)
+    for name in ("p.png", "g.png"):
+        assert read(tmp_path / name).std() > 0
+
+
+@pytest.mark.parametrize(("count", "at_most", "chosen"), [(1, 6, [0]), (3, 6, [0, 10, 20]), (11, 3, [0, 50, 100])])
+def test_evenly_keeps_first_and_last(count, at_most, chosen):
+    assert plots.evenly([10 * i for i in range(count)], at_most) == chosen

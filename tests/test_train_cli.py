@@ -1,0 +1,198 @@
+"""Training from the command line: refusals, the files of a run, interrupts and resumption."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apt_jax.config import PRESETS, Config
+from experiments import evaluate, run_dir, settings, sinks, train
+from experiments.errors import UsageError
+from experiments.problem import make_problem
+from experiments.run_dir import RunDir
+from experiments.settings import Experiment, Session
+
+ROOT = Path(__file__).parents[1]
+
+TINY = shlex.split(
+    """--method random --seeds 3 0 5 --env-steps 1200 --config.warmup-steps 200 --config.eval-every 100
+    --config.refresh-every 100 --config.replay-steps 400 --config.recent-steps 200 --config.replay-episodes 50
+    --config.updates-per-step 1 --config.batch-size 4 --config.eval-episodes 2 --config.probe-tasks 2"""
+)
+
+
+def start_run(path: Path, *options: str) -> Experiment:
+    """A run directory as the script leaves it before its first chunk."""
+    experiment, session = settings.parse(["--run-dir", str(path), *options])
+    train.open_run(experiment, session)
+    return experiment
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--seeds 1 2 1", "--seeds needs .* different .* got 1 2 1"),
+        ("--seeds -1", "must not be negative"),
+        ("--devices 0", "--devices must be at least 1"),
+        ("--checkpoint-every 0", "--checkpoint-every must be at least 1"),
+        ("--target-file missing.txt", "missing.txt is no file"),
+        ("--env-steps 10000", r"warmup_steps \(10000\) .* is 11000"),
+        ("--env-steps 20400", r"eval_every \(1000\); closest to 20400 is 20000"),
+        ("--space gird_world", "closest is 'grid_world'"),
+        ("--target a", "closest is 'A'"),
+        ("--method apt-gen", "Did you mean 'apt_gen'"),
+        ("--config.batch-size 5", "batch_size must be a positive multiple"),
+        ("--resume", "holds no run"),
+    ],
+)
+def test_mistakes_are_told_before_anything_is_written(tmp_path, options, message):
+    def prepare():
+        experiment, _ = settings.parse(["--run-dir", str(tmp_path / "run"), *options.split()])
+        make_problem(experiment)
+
+    with pytest.raises(UsageError, match=message):
+        prepare()
+    assert not (tmp_path / "run").exists()
+
+
+def test_options_override_the_preset(tmp_path):
+    experiment, _ = settings.parse(
+        ["--run-dir", str(tmp_path), "--preset", "fast", "--config.batch-size", "64", "--hparams.delta", "0.3"]
+    )
+    config, hparams = PRESETS["fast"]
+    assert experiment.config == dataclasses.replace(config, batch_size=64)
+    assert experiment.hparams == hparams.replace(delta=0.3)
+
+
+def test_a_run_is_never_overwritten(tmp_path):
+    start_run(tmp_path / "run")
+    before = (tmp_path / "run" / "config.json").read_bytes()
+    with pytest.raises(UsageError, match="not empty; pass --resume"):
+        start_run(tmp_path / "run", "--seeds", "7")
+    assert (tmp_path / "run" / "config.json").read_bytes() == before
+
+
+def test_resuming_defaults_to_the_saved_experiment(tmp_path):
+    saved = start_run(tmp_path, *TINY)
+    resumed, _ = settings.parse(["--run-dir", str(tmp_path), "--resume"])
+    assert resumed == saved
+    longer, _ = settings.parse(["--run-dir", str(tmp_path), "--resume", "--env-steps", "3000"])
+    assert longer == dataclasses.replace(saved, env_steps=3000)
+
+
+def test_resuming_names_every_difference(tmp_path):
+    start_run(tmp_path, *TINY)
+    options = "--resume --config.batch-size 8 --hparams.delta 0.3 --target B"
+    with pytest.raises(UsageError) as caught:
+        settings.parse(["--run-dir", str(tmp_path), *options.split()])
+    for difference in ("config.batch_size (saved 4, asked 8)", "hparams.delta (saved 0.5, asked 0.3)", "target (saved A"):
+        assert difference in str(caught.value)
+    assert "seeds" not in str(caught.value)
+    with pytest.raises(UsageError, match="saved 1200, asked 1000"):
+        settings.parse(["--run-dir", str(tmp_path), "--resume", "--env-steps", "1000"])
+
+
+def test_a_run_keeps_its_target_file(tmp_path):
+    file = tmp_path / "mine.txt"
+    file.write_text("first")
+    start_run(tmp_path / "run", "--target-file", str(file))
+    resume = ["--run-dir", str(tmp_path / "run"), "--resume"]
+    assert settings.parse([*resume, "--target-file", str(file)])[0].target == "A"
+    file.write_text("second")
+    assert settings.parse(resume)[0].target_file == tmp_path / "run" / "target.txt"
+    with pytest.raises(UsageError, match=r"target_file \(saved first, asked second\)"):
+        settings.parse([*resume, "--target-file", str(file)])
+
+
+def test_the_resume_command_repeats_how_not_what(tmp_path):
+    session = Session(Path("my run"), devices=1, sinks=("tensorboard",), method="random")
+    assert session.resume_command == ("python -m experiments.train --run-dir 'my run' --resume --devices 1 --sinks tensorboard")
+
+
+def test_rewinding_drops_what_came_after_the_checkpoint(tmp_path):
+    run = RunDir.create(tmp_path / "run", {}, None)
+    for step in (100, 200, 300):
+        run.append_metrics(step, step / 10, [4, 2], {"target_return": np.float32([step, -step]) / 7})
+        run.write_tasks(step, {"xy": np.zeros((2, 8, 3), np.float32)})
+    run.rewind(200)
+    env_steps, curves = run_dir.read_metrics(run.path)
+    assert env_steps.tolist() == [100, 200]
+    assert curves["seed"].tolist() == [[4, 4], [2, 2]]
+    np.testing.assert_array_equal(np.float32(curves["target_return"][1]), np.float32([-100, -200]) / 7)
+    assert list(run_dir.task_files(run.path)) == [100, 200]
+    assert run_dir.wall_seconds(run.path) == 20
+    run.rewind(0)
+    assert not (run.path / "metrics.csv").exists()
+
+
+def test_a_missing_sink_names_its_extra(monkeypatch):
+    monkeypatch.setitem(sinks._MODULES, "wandb", "a_module_that_does_not_exist")
+    with pytest.raises(UsageError, match=r"pip install 'apt-jax\[wandb\]'"):
+        sinks.check_installed(["wandb"])
+
+
+def test_tensorboard_writes_events(tmp_path):
+    pytest.importorskip("tensorboardX")
+    (sink,) = sinks.make_sinks(["tensorboard"], tmp_path, start=0, seeds=(0,), config={})
+    sink.write(100, {"beta": np.float32([1.0])})
+    sink.close()
+    assert list((tmp_path / "tensorboard").glob("events*"))
+
+
+def test_an_interrupted_run_resumes_as_if_nothing_happened(tmp_path, capsys):
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache"), "JAX_PLATFORMS": "cpu"}
+
+    def launch(*options: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "experiments.train", *options]
+        return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
+
+    run = tmp_path / "run"
+    with launch("--run-dir", str(run), *TINY) as process:
+        assert process.stdout
+        next(line for line in process.stdout if "steps/s" in line)
+        process.send_signal(signal.SIGINT)
+        rest = process.stdout.read()
+    assert process.returncode == 130
+    command = re.search(r"to go on: python -m experiments.train (.*)", rest)
+    assert command
+    assert len(rows_without_time(run)) < 3 * 10
+
+    with launch(*shlex.split(command[1])) as process:
+        process.communicate()
+    assert process.returncode == 0
+    with launch("--run-dir", str(tmp_path / "whole"), *TINY) as process:
+        process.communicate()
+    assert process.returncode == 0
+
+    assert rows_without_time(run) == rows_without_time(tmp_path / "whole")
+    assert len(rows_without_time(run)) == 3 * 10
+    summary = json.loads((run / "summary.json").read_text())
+    assert list(summary["seeds"]) == ["3", "0", "5"]
+    for name in ("learning_curves.png", "progression.png", "policy.gif"):
+        assert (run / name).stat().st_size > 1000
+
+    assert train.train(*settings.parse(["--run-dir", str(run), "--resume"])) == 0
+    assert "has all its 1,200 steps" in capsys.readouterr().out
+    evaluate.evaluate(evaluate.Args(run, target="B", episodes=2, gif=tmp_path / "film.gif"))
+    assert "B after 1,200 steps" in capsys.readouterr().out
+    assert (tmp_path / "film.gif").exists()
+
+
+def rows_without_time(path: Path) -> list[dict[str, str]]:
+    with (path / "metrics.csv").open() as stream:
+        return [{name: value for name, value in row.items() if name != "wall_seconds"} for row in csv.DictReader(stream)]
+
+
+def test_the_default_config_is_the_papers():
+    assert Experiment().config == Config() == PRESETS["paper"][0]
