@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import flax.struct
 
@@ -29,6 +28,9 @@ class HParams:
       beta_max: upper bound of beta (paper: 8).
       pessimism: standard deviations of the value ensemble taken off its mean, >= 0.
       value_weight_decay: decoupled weight decay of the value networks, per unit of their learning rate, >= 0.
+      cell_noise: probability that a cell of a generated grid is played with a uniformly drawn category, in [0, 1] (paper: 0).
+      vector_noise: standard deviation of the noise on generated vectors, as a share of their range, >= 0 (paper: 0).
+      progress_temperature: divides the discriminator's logit before the sigmoid that V1 learns, > 0 (paper: 1).
       spectral_bound: spectral norm of every layer of the discriminator, > 0.
     """
 
@@ -48,6 +50,9 @@ class HParams:
     beta_max: float = 8.0
     pessimism: float = 1.0
     value_weight_decay: float = 0.0
+    cell_noise: float = 0.1
+    vector_noise: float = 0.05
+    progress_temperature: float = 4.0
     spectral_bound: float = 0.8
 
 
@@ -70,7 +75,6 @@ class Config:
       model_batch_size: rollouts per source in such an update (paper: 128).
       rollout_steps: transitions of each rollout that the discriminator sees in one update.
       recent_steps: discriminator and values learn from the latest so many steps of each source (paper: 10,000).
-      progress: whether V1 learns the discriminator's "probability" (the paper's form) or its "logit".
       value_ensemble: networks behind each of V1 and V2, whose estimate is their mean less `pessimism` deviations (paper: 1).
       noise_size: length of the generator's noise z.
       refresh_every: steps between updates of beta (paper: 500).
@@ -92,7 +96,6 @@ class Config:
     model_batch_size: int = 128
     rollout_steps: int = 4
     recent_steps: int = 10_000
-    progress: Literal["probability", "logit"] = "logit"
     value_ensemble: int = 1
     noise_size: int = 32
     refresh_every: int = 500

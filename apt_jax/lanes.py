@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Key
@@ -64,10 +63,10 @@ def make_program(
         layout = "map" if used[0].platform == "cpu" else "vmap"
     mesh = Mesh(np.array(used), ("lane",))
     lane, shared = PartitionSpec("lane"), PartitionSpec()
-    padding = -lanes % len(used)
+    padded = np.minimum(np.arange(lanes + -lanes % len(used)), lanes - 1)
 
     def pad(tree: Any) -> Any:
-        return jax.tree.map(lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], padding, axis=0)]), tree) if padding else tree
+        return jax.tree.map(lambda x: x[padded], tree)
 
     def over_lanes(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
         batched = _vmap(function, in_specs, out_specs) if layout == "vmap" else _map(function, in_specs, out_specs)

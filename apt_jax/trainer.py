@@ -60,7 +60,7 @@ class Trainer(NamedTuple):
       init: `init(key, hparams) -> TrainState`; consumes `key`.
       warmup: `warmup(state, clock, hparams) -> (state, clock)`: `Config.warmup_steps` of random actions, no updates.
       chunk: `chunk(state, clock, hparams) -> (state, clock, metrics)`: `Config.eval_every` steps, then an evaluation.
-      propose: `propose(state, key, n) -> w`: tasks the curriculum would generate now, leaves [n, ...]; consumes `key`.
+      propose: `propose(state, key, n, hparams) -> w`: tasks the curriculum would generate now, leaves [n, ...]; consumes `key`.
       act: `act(params, obs) -> action`: greedy, for observations with any leading axes.
     """
 
@@ -70,7 +70,7 @@ class Trainer(NamedTuple):
     init: Callable[[Key[Array, ""], HParams], TrainState]
     warmup: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock]]
     chunk: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock, Metrics]]
-    propose: Callable[[TrainState, Key[Array, ""], int], Params]
+    propose: Callable[[TrainState, Key[Array, ""], int, HParams], Params]
     act: Callable[[Any, Obs], Int[Array, "..."]]
 
 
@@ -87,8 +87,8 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
     envs = config.envs_per_source
     steps = sources * envs
 
-    def assign(target: Any, state: Any, key: Key[Array, ""]) -> workers.Assignment:
-        w = curriculum.propose(state, key, envs) if curriculum.generates else None
+    def assign(target: Any, state: Any, key: Key[Array, ""], hparams: HParams) -> workers.Assignment:
+        w = curriculum.propose(state, key, envs, hparams) if curriculum.generates else None
         return workers.assign(space, target, w, envs)
 
     def init(key: Key[Array, ""], hparams: HParams) -> TrainState:
@@ -110,14 +110,14 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
                 columns=config.replay_steps // envs,
                 episodes=config.replay_episodes,
             ),
-            workers=workers.start(space, assign(target, curriculum_state, key_assign), key_start),
+            workers=workers.start(space, assign(target, curriculum_state, key_assign, hparams), key_start),
         )
 
-    def collect(state: TrainState, clock: Clock, key: Key[Array, ""], epsilon: Any) -> TrainState:
+    def collect(state: TrainState, clock: Clock, key: Key[Array, ""], epsilon: Any, hparams: HParams) -> TrainState:
         """Act, step and write: one step of every environment.  All writes come before any read of the rings."""
         key_act, key_assign, key_step = jax.random.split(key, 3)
         action = learner.epsilon_greedy(network, state.learner.params, state.workers.obs, key_act, epsilon)
-        assignment = assign(state.target, state.curriculum, key_assign)
+        assignment = assign(state.target, state.curriculum, key_assign, hparams)
         after, transition, episode, done = workers.step(space, state.workers, action, assignment, clock.iteration, key_step)
         return state._replace(workers=after, replay=replay.write(state.replay, clock.iteration, transition, episode, done))
 
@@ -154,18 +154,16 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         state, clock = carry
         key, key_collect, key_learn, key_adapt = jax.random.split(state.key, 4)
         epsilon = learner.epsilon_schedule(clock.env_steps - config.warmup_steps, hparams)
-        state = collect(state._replace(key=key), clock, key_collect, epsilon)
+        state = collect(state._replace(key=key), clock, key_collect, epsilon, hparams)
         state, learner_metrics = learn(state, clock, key_learn, hparams)
         state, curriculum_metrics = adapt(state, clock, key_adapt, hparams)
         return (state, tick(clock)), {"epsilon": epsilon, **learner_metrics, **curriculum_metrics}
 
     def warmup(state: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock]:
-        del hparams
-
         def step(carry: tuple[TrainState, Clock], _: None) -> tuple[tuple[TrainState, Clock], None]:
             state, clock = carry
             key, key_collect = jax.random.split(state.key)
-            return (collect(state._replace(key=key), clock, key_collect, 1.0), tick(clock)), None
+            return (collect(state._replace(key=key), clock, key_collect, 1.0, hparams), tick(clock)), None
 
         return jax.lax.scan(step, (state, clock), length=config.warmup_steps // steps)[0]
 
@@ -193,7 +191,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         }
         if curriculum.generates:
             epsilon = learner.epsilon_schedule(clock.env_steps - config.warmup_steps, hparams)
-            w = curriculum.propose(state.curriculum, key_propose, config.probe_tasks)
+            w = curriculum.propose(state.curriculum, key_propose, config.probe_tasks, hparams)
             tasks = jax.vmap(space.instantiate)(w)
 
             def explore(obs: Obs, key: Key[Array, ""]) -> Int[Array, "n"]:
@@ -222,8 +220,8 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         state, eval_metrics = evaluate(state, clock, hparams)
         return state, clock, {**_mean(metrics), **eval_metrics}
 
-    def propose(state: TrainState, key: Key[Array, ""], n: int) -> Params:
-        return curriculum.propose(state.curriculum, key, n)
+    def propose(state: TrainState, key: Key[Array, ""], n: int, hparams: HParams) -> Params:
+        return curriculum.propose(state.curriculum, key, n, hparams)
 
     def act(params: Any, obs: Obs) -> Int[Array, "..."]:
         return learner.greedy(network, params, obs)

@@ -36,7 +36,7 @@ class Runner:
         self._keys = lane_keys(experiment.seeds)
         self._states = self._program.init(self._keys, self._hparams)
         self._clock = jax.device_put(Clock.start(), _replicated(self._states))
-        self._propose = jax.jit(jax.vmap(trainer.propose, in_axes=(0, 0, None)), static_argnums=2)
+        self._propose = jax.jit(jax.vmap(trainer.propose, in_axes=(0, 0, None, 0)), static_argnums=2)
         self._warmup: Callable[..., Any] = self._program.warmup
         self._chunk: Callable[..., Any] = self._program.chunk
         self.generates = trainer.generates
@@ -64,7 +64,9 @@ class Runner:
     def propose(self, n: int) -> Params:
         """`n` tasks that each seed's curriculum would generate now, leaves [L, n, ...]."""
         keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, _PROPOSE_STREAM), self.env_steps))(self._keys)
-        w = self._propose(self._states, _pad(keys, self._states.key.shape[0]), n)
+        rows = self._states.key.shape[0]
+        keys, hparams = jax.tree.map(lambda x: _pad(x, rows), (keys, self._hparams))
+        w = self._propose(self._states, keys, n, hparams)
         return self._first(w)
 
     @property

@@ -22,6 +22,10 @@ coordinates = arrays(np.float32, 10, elements=st.floats(0, 10, width=32))
 plans = arrays(np.int32, HORIZON, elements=st.integers(0, 3))
 params = st.builds(lambda tiles, xy: {"tiles": np.eye(3, dtype=np.float32)[tiles], "xy": xy}, categories, coordinates)
 
+instantiate = jax.jit(SPACE.instantiate)
+describe = jax.jit(SPACE.describe)
+step = jax.jit(SPACE.step)
+
 
 @jax.jit
 def rollout(w, actions):
@@ -102,7 +106,7 @@ def test_values_lie_in_the_ranges_of_the_spec(w, actions):
 
 @given(params)
 def test_objects_stand_apart_on_interior_floor(w):
-    task = jax.device_get(jax.jit(SPACE.instantiate)(w))
+    task = jax.device_get(instantiate(w))
     places = task.objects[task.present]
     assert len({tuple(place) for place in places.tolist()}) == len(places)
     assert ((places >= 1) & (places <= 8)).all()
@@ -114,7 +118,7 @@ def test_objects_stand_apart_on_interior_floor(w):
 
 @given(params)
 def test_layouts_read_back(w):
-    task = SPACE.instantiate(w)
+    task = instantiate(w)
     text = format_layout(task)
     if text.startswith("A") and task.present[GOAL]:
         jax.tree.map(np.testing.assert_array_equal, parse_layout(text), task)
@@ -122,7 +126,7 @@ def test_layouts_read_back(w):
 
 @given(params)
 def test_descriptions_are_in_range(w):
-    described = jax.device_get(jax.jit(lambda w: SPACE.describe(SPACE.instantiate(w)))(w))
+    described = jax.device_get(describe(instantiate(w)))
     assert described["feasible"] == np.isfinite(described["solution_length"])
     assert not described["solution_length"] < 1
     assert not described["solution_length"] > HORIZON
@@ -133,9 +137,9 @@ def test_descriptions_are_in_range(w):
 def test_a_key_once_taken_stays_taken(actions):
     task = parse_layout("Ay......\nb.......\n" + "........\n" * 5 + ".......G")
     start, _ = SPACE.reset(jax.random.key(0), task)
-    step = jax.jit(SPACE.step)
     state, taken = start, np.zeros(2, bool)
+    key_places = np.asarray(task.objects[KEYS])
     for action in actions[:10]:
         state = step(state, jnp.asarray(action), task).state
-        taken |= (np.asarray(state.position) == task.objects[KEYS]).all(axis=-1)
+        taken |= (np.asarray(state.position) == key_places).all(axis=-1)
         np.testing.assert_array_equal(state.keys, taken)

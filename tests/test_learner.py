@@ -58,7 +58,8 @@ def test_restore_rule_at_its_edges(scores, expected):
 def test_equality_is_no_drop():
     new = _marked(2)
     state, _, drop = learner.keep_or_restore(new, learner.Kept(_marked(1), jnp.float32(0.5)), jnp.float32(0.5))
-    assert not drop and state == new
+    assert not drop
+    assert state == new
 
 
 def test_epsilon_falls_linearly_then_stays():

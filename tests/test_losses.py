@@ -61,7 +61,8 @@ def test_discriminator_loss_pushes_where_it_is_wrong():
 
 def test_discriminator_gradient_raises_target_and_lowers_generated():
     raise_target, lower_generated = jax.grad(losses.discriminator_loss, argnums=(0, 1))(jnp.zeros(3), jnp.zeros(3))
-    assert (raise_target < 0).all() and (lower_generated > 0).all()
+    assert (raise_target < 0).all()
+    assert (lower_generated > 0).all()
 
 
 def test_generator_objective_is_equation_three():

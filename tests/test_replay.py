@@ -99,7 +99,8 @@ def test_sampled_transitions_are_whole_recent_and_equally_shared(iterations):
     np.testing.assert_array_equal(np.asarray(batch.next_obs["x"])[..., 0], code + 1)
     source, iteration = code // 10_000, code % 100
     assert (np.sum(source == 0, axis=1) == 32).all()
-    assert iteration.min() >= max(0, iterations - COLUMNS) and iteration.max() < iterations
+    assert iteration.min() >= max(0, iterations - COLUMNS)
+    assert iteration.max() < iterations
     written = min(iterations, COLUMNS) * ENVS * SOURCES
     assert len(np.unique(code)) == written, "3,200 draws from at most 96 rows miss none"
 

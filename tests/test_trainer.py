@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.corridor import Corridor
 
 from apt_jax.config import Config, HParams
 from apt_jax.lanes import make_program, stack_hparams
 from apt_jax.trainer import Clock, make_trainer
+from tests.corridor import Corridor
 
 SPACE = Corridor()
 TARGET = np.int32(7)

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from apt_jax.config import Config
-from apt_jax.curricula.apt_gen import apt_gen
+from apt_jax.curricula import apt_gen, random, target_only
 from apt_jax.curricula.base import Curriculum
-from apt_jax.curricula.random import random
-from apt_jax.curricula.target_only import target_only
 from apt_jax.registry import look_up
 from apt_jax.task_space import TaskSpace
 
 METHODS: dict[str, Callable[[TaskSpace, Config], Curriculum]] = {
-    "apt_gen": apt_gen,
-    "random": random,
-    "target_only": target_only,
+    "apt_gen": apt_gen.make,
+    "random": random.make,
+    "target_only": target_only.make,
 }
 
 

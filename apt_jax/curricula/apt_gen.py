@@ -57,12 +57,13 @@ def as_instantiated(spec: Spec, w: Params) -> Params:
     return {name: harden(name) for name in w}
 
 
-def apt_gen(space: TaskSpace, config: Config) -> Curriculum:
+def make(space: TaskSpace, config: Config) -> Curriculum:
     """The paper's curriculum."""
     generator = Generator(space.param_spec)
     discriminator = Discriminator(space.obs_spec, space.num_actions)
     value = ValueNetwork(space.param_spec)
     recent = config.recent_steps // config.envs_per_source
+    batch = config.model_batch_size
 
     def noise(key: Key[Array, ""], n: int) -> Float[Array, "n z"]:
         return jax.random.normal(key, (n, config.noise_size))
@@ -102,10 +103,11 @@ def apt_gen(space: TaskSpace, config: Config) -> Curriculum:
         )
 
         # The first tasks are drawn from running statistics, which must describe the fresh generator before it is used.
-        def settle(stats: Any, key: Key[Array, ""]) -> tuple[Any, None]:
-            return generate(models.generator, stats, noise(key, config.model_batch_size))[1], None
+        def settle(stats: Any, z: Float[Array, "n z"]) -> tuple[Any, None]:
+            return generate(models.generator, stats, z)[1], None
 
-        batch_stats, _ = jax.lax.scan(settle, variables["batch_stats"], jax.random.split(key_stats, 100))
+        z = noise(key_stats, 100 * batch).reshape(100, batch, config.noise_size)
+        batch_stats, _ = jax.lax.scan(settle, variables["batch_stats"], z)
         return AptGenState(
             models=models,
             opt_state=_ADAM.init(models),
@@ -114,9 +116,11 @@ def apt_gen(space: TaskSpace, config: Config) -> Curriculum:
             beta=jnp.asarray(hparams.beta_init, jnp.float32),
         )
 
-    def propose(state: AptGenState, key: Key[Array, ""], n: int) -> Params:
+    def propose(state: AptGenState, key: Key[Array, ""], n: int, hparams: HParams) -> Params:
+        key_z, key_explore = jax.random.split(key)
         variables = {"params": state.models.generator, "batch_stats": state.batch_stats}
-        return apply(generator, variables, noise(key, n), train=False)
+        w = apply(generator, variables, noise(key_z, n), train=False)
+        return explore(space.param_spec, w, key_explore, hparams)
 
     def update(
         state: AptGenState, key: Key[Array, ""], replay: rp.Replay, iteration: Int[Array, ""], hparams: HParams
@@ -129,14 +133,14 @@ def apt_gen(space: TaskSpace, config: Config) -> Curriculum:
                 key,
                 iteration,
                 source=source,
-                batch_size=config.model_batch_size,
+                batch_size=batch,
                 steps=config.rollout_steps,
                 recent=recent,
             )
 
         target, generated = sample(key_target, TARGET), sample(key_generated, GENERATED)
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), target, generated)
-        z = noise(key_z, config.model_batch_size)
+        z = noise(key_z, batch)
 
         def loss(models: Models) -> tuple[Float[Array, ""], tuple[Any, Any, Metrics]]:
             """All four objectives: each parameter group receives the gradient of its own alone."""
@@ -144,7 +148,7 @@ def apt_gen(space: TaskSpace, config: Config) -> Curriculum:
             target_logit, generated_logit = jnp.split(score(params, both), 2)
             loss_d = discriminator_loss(target_logit, generated_logit)
 
-            progress = jax.lax.stop_gradient(progress_score(generated_logit, config.progress))
+            progress = jax.lax.stop_gradient(jax.nn.sigmoid(generated_logit / hparams.progress_temperature))
             progress_error = evaluate(models.progress_value, generated.w) - progress[None]
             return_error = evaluate(models.return_value, generated.w) - generated.episode_return[None]
 
@@ -214,9 +218,24 @@ def _descend(params: Any, direction: Any, rate: Float[Array, ""] | float) -> Any
     return jax.tree.map(lambda p, d: p - rate * d, params, direction)
 
 
-def progress_score(logit: Float[Array, "B"], form: str) -> Float[Array, "B"]:
-    """The task progress eta that V1 learns: the discriminator's "probability" (the paper's form) or its "logit"."""
-    return jax.nn.sigmoid(logit) if form == "probability" else logit
+def explore(spec: Spec, w: Params, key: Key[Array, ""], hparams: HParams) -> Params:
+    """Exploration noise on generated tasks (leaves [n, ...]), as an actor's actions get; consumes `key`.
+
+    The value networks can only tell the generator which way to go where tasks were played that differ in that direction.
+    """
+    explored = {}
+    for (name, modality), key_block in zip(spec.items(), jax.random.split(key, len(spec)), strict=True):
+        block = w[name]
+        key_noise, key_cell = jax.random.split(key_block)
+        if isinstance(modality, Grid):
+            scores = jax.random.uniform(key_noise, block.shape)
+            replaced = jax.random.uniform(key_cell, block.shape[:-1]) < hparams.cell_noise
+            explored[name] = jnp.where(replaced[..., None], scores, block)
+        else:
+            spread = hparams.vector_noise * (modality.high - modality.low)
+            noisy = block + spread * jax.random.normal(key_noise, block.shape)
+            explored[name] = jnp.clip(noisy, modality.low, modality.high)
+    return explored
 
 
 def pessimistic(values: Float[Array, "K n"], pessimism: Float[Array, ""] | float) -> Float[Array, "n"]:

@@ -23,9 +23,9 @@ class InitFn(Protocol):
 
 
 class ProposeFn(Protocol):
-    """`propose(state, key, n) -> w`: `n` task parameters, leaves [n, ...]; consumes `key`."""
+    """`propose(state, key, n, hparams) -> w`: `n` task parameters, leaves [n, ...]; consumes `key`."""
 
-    def __call__(self, state: Any, key: Key[Array, ""], n: int) -> Params: ...
+    def __call__(self, state: Any, key: Key[Array, ""], n: int, hparams: HParams) -> Params: ...
 
 
 class UpdateFn(Protocol):

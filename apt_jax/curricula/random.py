@@ -13,7 +13,7 @@ from apt_jax.specs import Params
 from apt_jax.task_space import TaskSpace
 
 
-def random(space: TaskSpace, config: Config) -> Curriculum:
+def make(space: TaskSpace, config: Config) -> Curriculum:
     """Uniform over task parameters, whatever the agent has learned."""
     del config
 
@@ -21,8 +21,8 @@ def random(space: TaskSpace, config: Config) -> Curriculum:
         del key, hparams
         return ()
 
-    def propose(state: Any, key: Key[Array, ""], n: int) -> Params:
-        del state
+    def propose(state: Any, key: Key[Array, ""], n: int, hparams: HParams) -> Params:
+        del state, hparams
         return jax.vmap(space.sample_uniform)(jax.random.split(key, n))
 
     return Curriculum(True, init, propose, no_update, no_refresh, no_report)

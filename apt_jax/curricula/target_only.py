@@ -12,7 +12,7 @@ from apt_jax.specs import Params
 from apt_jax.task_space import TaskSpace
 
 
-def target_only(space: TaskSpace, config: Config) -> Curriculum:
+def make(space: TaskSpace, config: Config) -> Curriculum:
     """The null plug-in: there is no generated source."""
     del space, config
 
@@ -20,7 +20,7 @@ def target_only(space: TaskSpace, config: Config) -> Curriculum:
         del key, hparams
         return ()
 
-    def propose(state: Any, key: Key[Array, ""], n: int) -> Params:
+    def propose(state: Any, key: Key[Array, ""], n: int, hparams: HParams) -> Params:
         raise ValueError("target_only generates no tasks")
 
     return Curriculum(False, init, propose, no_update, no_refresh, no_report)

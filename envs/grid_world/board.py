@@ -45,9 +45,9 @@ class Task(NamedTuple):
     present: Bool[Array, "5"]
 
     @property
-    def tiles(self) -> UInt8[Array, "10 10"]:
-        """Tile categories of the board, border included."""
-        return self.padded[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    def tiles(self) -> UInt8[Array, "*batch 10 10"]:
+        """Tile categories of the board, border included; of every board if tasks are stacked."""
+        return self.padded[..., MARGIN:-MARGIN, MARGIN:-MARGIN]
 
 
 def make_task(interior: UInt8[Array, "8 8"], objects: Int32[Array, "5 2"], present: Bool[Array, "5"]) -> Task:

@@ -63,7 +63,7 @@ def step(state: State, action: Int[Array, ""], task: Task) -> StepOutput:
 
     # Reaching the goal ends an episode, so an agent about to move off the goal must have started there.
     started_on_goal = task.present[GOAL] & jnp.all(task.objects[GOAL] == state.position)
-    success = met[GOAL] & ~started_on_goal
+    success = met[GOAL]
     died = (tile == LAVA) | jnp.any(met[DOORS])
     hit_wall = tile == WALL
     stays = started_on_goal | died | hit_wall

@@ -1,10 +1,13 @@
 """The procedural generation module M(w): from tile scores and object coordinates to a task.
 
-The paper's rule is read as follows (appendix "Grid-World").  An object stands on the tile its coordinates lie in.  It does not
-appear if that tile is on the border or already holds an earlier object in the order goal, yellow door, blue door, yellow key,
-blue key; otherwise its tile becomes empty floor.  On the start tile a goal is legal (the agent starts on the goal), while a door
-or a key does not appear there.  A door stays closed if its key does not appear, for whatever reason; a key whose door does not
-appear can be taken and opens nothing.
+The paper's rule is read as follows (appendix "Grid-World"):
+
+* An object stands on the tile its coordinates lie in, and that tile becomes empty floor.
+* It does not appear if that tile is on the border or already holds an earlier object, in the order goal, yellow door, blue
+  door, yellow key, blue key.
+* On the start tile a goal is legal (the agent starts on the goal), while a door or a key does not appear there.
+* A door stays closed if its key does not appear, for whatever reason.
+* A key whose door does not appear can be taken and opens nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ PARAM_SPEC: Spec = {
     "tiles": Grid(INTERIOR, INTERIOR, CATEGORIES),
     "xy": Vector(2 * OBJECTS, low=0, high=BOARD),
 }
-"""The paper's 74 variables: 64 tile categories (as scores) and 5 pairs (row, column) in tile widths from the upper-left corner."""
+"""The paper's 74 variables: 64 tile categories, as scores, and 5 pairs (row, column) in tile widths from the upper left."""
 
 
 def place(w: Params) -> Task:
@@ -46,8 +49,8 @@ def appears(objects: Int32[Array, "5 2"]) -> Bool[Array, "5"]:
     on_border = jnp.any((objects == 0) | (objects == BOARD - 1), axis=-1)
     on_start = jnp.all(objects == jnp.array(START)[None, :], axis=-1)
     same_tile = jnp.all(objects[:, None, :] == objects[None, :, :], axis=-1)
-    # An earlier object that was itself refused occupies nothing, yet needs no exception here: what kept it off this tile (border,
-    # start, a still earlier object) keeps the later object off it too.
+    # An earlier object that was itself refused occupies nothing, yet needs no exception here: what kept it off this tile
+    # (border, start, a still earlier object) keeps the later object off it too.
     occupied = jnp.any(jnp.tril(same_tile, k=-1), axis=-1)
     is_goal = jnp.arange(OBJECTS) == GOAL
     return ~(on_border | occupied | (on_start & ~is_goal))

@@ -213,7 +213,7 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
         """States of the three updates; how well the networks are trained changes nothing in their cost."""
         key_d, key_spectral, key_1, key_2, key_g = jax.random.split(key, 5)
         obs, w = zeros_like(obs_struct(space.obs_spec)), zeros_like(param_struct(space.param_spec))
-        params_d = discriminator.init(key_d, obs, jnp.int32(0), reward=jnp.float32(0.0), next_obs=obs)
+        params_d: Any = discriminator.init(key_d, obs, jnp.int32(0), reward=jnp.float32(0.0), next_obs=obs)
         values = value.init(key_1, w), value.init(key_2, w)
         variables = generator.init(key_g, jnp.zeros((2, config.noise_size)), train=True)
         return (

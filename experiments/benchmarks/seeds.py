@@ -8,15 +8,17 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from apt_jax.lanes import make_program, stack_hparams
-from apt_jax.trainer import Clock, make_trainer
+from apt_jax.trainer import Clock, TrainState, make_trainer
 from experiments import runtime
 from experiments.benchmarks import _measure
 from experiments.benchmarks._measure import Options, Timing
@@ -76,16 +78,12 @@ def main() -> int:
 
 
 def time_seeds(layout: Literal["map", "vmap"], devices: int, args: Args) -> Arrangement:
-    """Every number of seeds that fills `devices`, in this process."""
+    """Every number of seeds that `devices` divide equally, in this process."""
     _measure.pin(args.cores)
     runtime.setup(cpu_devices=devices)
     if jax.device_count() < devices:
         raise UsageError(f"--devices must be at most {jax.device_count()} here, got {devices}")
-    return Arrangement(layout, devices, {n: _time(n, layout, devices, args) for n in args.seeds if n >= devices})
-
-
-def _time(seeds: int, layout: Literal["map", "vmap"], devices: int, args: Args) -> Timing:
-    problem = _measure.load_problem(
+    space, target, config, hparams = _measure.load_problem(
         args.preset,
         warmup_steps=1_000,
         refresh_every=args.chunk_steps,
@@ -93,15 +91,25 @@ def _time(seeds: int, layout: Literal["map", "vmap"], devices: int, args: Args) 
         eval_episodes=1,
         probe_tasks=1,
     )
-    trainer = make_trainer(problem.space, problem.target, problem.config)
-    used = jax.devices()[:devices]
-    program = make_program(trainer, seeds, layout=layout, devices=used)
-    hparams = stack_hparams([problem.hparams] * seeds)
-    states = program.init(jax.random.split(jax.random.key(0), seeds), hparams)
-    clock = jax.device_put(Clock.start(), NamedSharding(Mesh(np.array(used), ("lane",)), PartitionSpec()))
-    states, clock = program.warmup(states, clock, hparams)
-    timing, _ = _measure.time_calls(program.chunk, (states, clock), hparams, repeats=args.repeats)
-    return timing.per(seeds * args.chunk_steps / 1_000)
+    trainer = make_trainer(space, target, config)
+    # One warm-up serves all: compiling it for every number of seeds would take longer than everything measured.
+    state = jax.jit(trainer.init)(jax.random.key(0), hparams)
+    state, clock = jax.jit(trainer.warmup, donate_argnums=0)(state, Clock.start(), hparams)
+    mesh = Mesh(np.array(jax.devices()[:devices]), ("lane",))
+    shared, lane = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("lane"))
+
+    def time_lanes(lanes: int) -> Timing:
+        @partial(jax.jit, out_shardings=lane)
+        def tile(state: TrainState) -> TrainState:
+            states = jax.tree.map(lambda x: jnp.stack([x] * lanes), state)
+            return states._replace(key=jax.random.split(state.key, lanes))
+
+        program = make_program(trainer, lanes, layout=layout, devices=jax.devices()[:devices])
+        carry = tile(state), jax.device_put(clock, shared)
+        timing, _ = _measure.time_calls(program.chunk, carry, stack_hparams([hparams] * lanes), repeats=args.repeats)
+        return timing.per(lanes * args.chunk_steps / 1_000)
+
+    return Arrangement(layout, devices, {lanes: time_lanes(lanes) for lanes in args.seeds if lanes % devices == 0})
 
 
 if __name__ == "__main__":

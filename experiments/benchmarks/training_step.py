@@ -51,7 +51,7 @@ class Args(Options):
 
     presets: tuple[Literal["paper", "fast"], ...] = ("paper", "fast")
     cores: int = 1
-    at_least: float = 0.5
+    at_least: float = 0.3
 
 
 @dataclass(frozen=True)

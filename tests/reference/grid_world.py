@@ -9,7 +9,7 @@ import math
 
 
 class ReferenceWorld:
-    """One task and its running episode; a board is a dict from (row, column) to a word, things are a dict from name to place."""
+    """One task and its running episode: a dict from (row, column) to a word, and one from a thing's name to its place."""
 
     def __init__(self, scores, xy):
         """`scores` is an 8 x 8 x 3 nested list of tile scores, `xy` a list of 10 numbers in [0, 10]."""
