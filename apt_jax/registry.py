@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
+from difflib import SequenceMatcher
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -13,10 +13,9 @@ def look_up(registry: Mapping[str, T], name: str, kind: str) -> T:
     """The entry `name`.
 
     Raises:
-      ValueError: no such entry; the message names the closest match and every allowed name.
+      ValueError: no such entry; the message names the closest one and all that are allowed.
     """
     if name in registry:
         return registry[name]
-    close = difflib.get_close_matches(name, registry, n=1)
-    hint = f" Did you mean {close[0]!r}?" if close else ""
-    raise ValueError(f"Unknown {kind} {name!r}.{hint} Allowed: {', '.join(sorted(registry))}.")
+    closest = max(registry, key=lambda entry: SequenceMatcher(None, name.casefold(), entry.casefold()).ratio())
+    raise ValueError(f"unknown {kind} {name!r}; closest is {closest!r}, allowed are {', '.join(sorted(registry))}")

@@ -6,17 +6,15 @@ A new space is a package with a class that fulfils `BenchmarkSpace`, and one ent
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from difflib import SequenceMatcher
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import UInt8
 
+from apt_jax.registry import look_up
 from apt_jax.task_space import TaskSpace
 from envs import grid_world
-
-T = TypeVar("T")
 
 
 class BenchmarkSpace(TaskSpace, Protocol):
@@ -45,13 +43,13 @@ SPACES: Mapping[str, Callable[[], BenchmarkSpace]] = {
 
 def make(name: str) -> BenchmarkSpace:
     """The task space called `name`; raises ValueError on a wrong name."""
-    return _lookup(SPACES, name, "task space")()
+    return look_up(SPACES, name, "task space")()
 
 
 def load_target(space_name: str, target: str) -> Any:
     """The target task called `target` (such as "A") of a space; raises ValueError on a wrong name."""
     space = make(space_name)
-    return space.parse_target(_lookup(space.targets, target, f"target of {space_name}"))
+    return space.parse_target(look_up(space.targets, target, f"target of {space_name}"))
 
 
 def load_target_file(space_name: str, path: str | Path) -> Any:
@@ -67,11 +65,3 @@ def load_target_file(space_name: str, path: str | Path) -> Any:
         return space.parse_target(text)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def _lookup(table: Mapping[str, T], name: str, kind: str) -> T:
-    """`table[name]`, or a ValueError that names the closest entry and all others."""
-    if name in table:
-        return table[name]
-    closest = max(table, key=lambda entry: SequenceMatcher(None, name.casefold(), entry.casefold()).ratio())
-    raise ValueError(f"unknown {kind} {name!r}; closest is {closest!r}, allowed are {', '.join(sorted(table))}")

@@ -243,6 +243,14 @@ def test_spectral_normalize_covers_every_kernel_of_the_discriminator():
         np.testing.assert_allclose(np.linalg.norm(kernel, ord=2), 0.8, rtol=0.02)
 
 
+def test_spectral_normalize_leaves_kernels_within_the_bound_alone():
+    params = initial_params("discriminator")["params"]
+    u = init_singular_vectors(jax.random.key(1), params)
+    unbounded, _ = spectral_normalize(params, u, bound=np.inf)
+    for before, after in zip(jax.tree.leaves(params), jax.tree.leaves(unbounded), strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
 def loss_of(network, batch):
     return lambda params: sum(jnp.mean(jnp.square(y)) for y in jax.tree.leaves(network.apply(params, **batch)))
 

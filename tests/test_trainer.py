@@ -149,7 +149,7 @@ def test_the_final_observation_is_stored_not_the_reset_one():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"method": "apt-gen"}, "Did you mean 'apt_gen'"),
+        ({"method": "apt-gen"}, "unknown method 'apt-gen'; closest is 'apt_gen'"),
         ({"batch_size": 15}, "batch_size .* 2 sources, got 15"),
         ({"eval_every": 50}, "eval_every must be a multiple of refresh_every=20, got 50|multiple of the 4"),
         ({"refresh_every": 18}, "refresh_every .* 4 environment steps"),

@@ -53,10 +53,13 @@ def spectral_norm(
 def spectral_normalize(
     params: Variables, u: SingularVectors, *, bound: float | Float[Array, ""]
 ) -> tuple[Variables, SingularVectors]:
-    """Scales every kernel to spectral norm `bound` (> 0) and moves `u` by one power iteration; biases pass unchanged."""
+    """Scales every kernel of spectral norm above `bound` (> 0) down to it; biases pass unchanged.
+
+    Also moves `u` by one power iteration.
+    """
     leaves = flatten_dict(params, sep=_SEPARATOR)
     new_u = {}
     for path, vector in u.items():
         sigma, new_u[path] = spectral_norm(leaves[path], vector)
-        leaves[path] = leaves[path] * (bound / (sigma + _EPSILON))
+        leaves[path] = leaves[path] * jnp.minimum(1.0, bound / (sigma + _EPSILON))
     return unflatten_dict(leaves, sep=_SEPARATOR), new_u
