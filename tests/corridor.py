@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +25,8 @@ class Corridor:
     """The agent starts at tile 0 and moves left or right; tile `goal` pays 1 and ends the episode; `paint` does nothing."""
 
     name = "corridor"
-    obs_spec = {"position": Vector(1, 0, LENGTH, "uint8"), "offset": Vector(1, -LENGTH, LENGTH, "int8")}
-    param_spec = {"goal": Vector(1, 0, LENGTH), "paint": Grid(4, 4, 2)}
+    obs_spec: ClassVar = {"position": Vector(1, 0, LENGTH, "uint8"), "offset": Vector(1, -LENGTH, LENGTH, "int8")}
+    param_spec: ClassVar = {"goal": Vector(1, 0, LENGTH), "paint": Grid(4, 4, 2)}
     num_actions = 2
     horizon = 12
 
