@@ -112,6 +112,7 @@ PRESETS: dict[str, tuple[Config, HParams]] = {
         Config(envs_per_source=5, updates_per_step=2, model_updates_per_step=0.2, model_batch_size=64, value_ensemble=4),
         HParams(
             learning_rate=1e-3,
+            gamma=0.97,
             value_weight_decay=10.0,
             cell_noise=0.1,
             vector_noise=0.05,

@@ -24,23 +24,32 @@ class Outcome(NamedTuple):
     length: Int[Array, "n"]
 
 
+class _Playing(NamedTuple):
+    """Episodes under way; those that are over are stepped on but count no more."""
+
+    key: Key[Array, ""]
+    state: Any
+    obs: Obs
+    over: Bool[Array, "n"]
+    outcome: Outcome
+
+
 def play(space: TaskSpace, tasks: Any, policy: Policy, key: Key[Array, ""]) -> Outcome:
     """One episode on each task (leaves [n, ...]), all side by side for `space.horizon` steps; consumes `key`."""
     n = jax.tree.leaves(tasks)[0].shape[0]
     key_reset, key_policy = jax.random.split(key)
     state, obs = jax.vmap(space.reset)(jax.random.split(key_reset, n), tasks)
 
-    def step(carry: tuple[Any, Obs, Bool[Array, "n"], Outcome], key: Key[Array, ""]) -> tuple[Any, None]:
-        state, obs, over, outcome = carry
-        out = jax.vmap(space.step)(state, policy(obs, key), tasks)
+    def step(carry: _Playing, _: None) -> tuple[_Playing, None]:
+        key, key_action = jax.random.split(carry.key)
+        out = jax.vmap(space.step)(carry.state, policy(carry.obs, key_action), tasks)
         outcome = Outcome(
-            episode_return=outcome.episode_return + jnp.where(over, 0.0, out.reward),
-            success=outcome.success | (out.success & ~over),
-            length=outcome.length + jnp.where(over, 0, 1),
+            episode_return=carry.outcome.episode_return + jnp.where(carry.over, 0.0, out.reward),
+            success=carry.outcome.success | (out.success & ~carry.over),
+            length=carry.outcome.length + jnp.where(carry.over, 0, 1),
         )
-        return (out.state, out.obs, over | out.terminated | out.truncated, outcome), None
+        return _Playing(key, out.state, out.obs, carry.over | out.terminated | out.truncated, outcome), None
 
     start = Outcome(jnp.zeros(n), jnp.zeros(n, bool), jnp.zeros(n, jnp.int32))
-    carry = (state, obs, jnp.zeros(n, bool), start)
-    (_, _, _, outcome), _ = jax.lax.scan(step, carry, jax.random.split(key_policy, space.horizon))
-    return outcome
+    playing = _Playing(key_policy, state, obs, jnp.zeros(n, bool), start)
+    return jax.lax.scan(step, playing, length=space.horizon)[0].outcome

@@ -143,11 +143,14 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         return state._replace(learner=learner_state), _mean(metrics)
 
     def adapt(state: TrainState, clock: Clock, key: Key[Array, ""], hparams: HParams) -> tuple[TrainState, Metrics]:
-        def update(carry: Any, key: Key[Array, ""]) -> tuple[Any, Metrics]:
-            return curriculum.update(carry, key, state.replay, clock.iteration, hparams)
+        def update(carry: tuple[Any, Key[Array, ""]], _: None) -> tuple[tuple[Any, Key[Array, ""]], Metrics]:
+            curriculum_state, key = carry
+            key, key_update = jax.random.split(key)
+            curriculum_state, metrics = curriculum.update(curriculum_state, key_update, state.replay, clock.iteration, hparams)
+            return (curriculum_state, key), metrics
 
         rounds = round(config.model_updates_per_step * steps)
-        curriculum_state, metrics = jax.lax.scan(update, state.curriculum, jax.random.split(key, rounds))
+        (curriculum_state, _), metrics = jax.lax.scan(update, (state.curriculum, key), length=rounds)
         return state._replace(curriculum=curriculum_state), _mean(metrics)
 
     def iteration(carry: tuple[TrainState, Clock], hparams: HParams) -> tuple[tuple[TrainState, Clock], Metrics]:

@@ -146,6 +146,16 @@ def test_the_final_observation_is_stored_not_the_reset_one():
     assert (steps.next_obs["offset"][ended] == 0).all()
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_learns_the_corridors_target(method):
+    """Nine tiles and twelve steps: a random policy reaches the far end in less than one of fifty episodes."""
+    cfg = config(
+        method, warmup_steps=400, updates_per_step=2, batch_size=64, replay_steps=2000, refresh_every=100, eval_every=400
+    )
+    _, _, history = run(cfg, [0, 1], chunks=8, hparams=[HParams(learning_rate=1e-3, epsilon_steps=400.0)] * 2)
+    assert (history[-1]["target_return"] > 0.9).all()
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
