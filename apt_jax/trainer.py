@@ -80,9 +80,10 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
     Raises:
       ValueError: an unknown method, or sizes that do not fit together (what, and what is allowed).
     """
+    check_counts(config)
     curriculum = make_curriculum(space, config)
     sources = 2 if curriculum.generates else 1
-    validate(config, sources, space.horizon)
+    check_sizes(config, sources, space.horizon)
     network = QNetwork(space.obs_spec, space.num_actions)
     envs = config.envs_per_source
     steps = sources * envs
@@ -232,7 +233,32 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
     return Trainer(space, config, curriculum.generates, init, warmup, chunk, propose, act)
 
 
-def validate(config: Config, sources: int, horizon: int) -> None:
+def check_counts(config: Config) -> None:
+    """Check that whatever is counted is there at least once.
+
+    Raises:
+      ValueError: the field, its value, and what is allowed.
+    """
+    counts = (
+        "envs_per_source",
+        "updates_per_step",
+        "n_step",
+        "replay_episodes",
+        "model_batch_size",
+        "rollout_steps",
+        "recent_steps",
+        "value_ensemble",
+        "noise_size",
+        "return_window",
+        "eval_episodes",
+        "probe_tasks",
+    )
+    for name in counts:
+        if getattr(config, name) < 1:
+            raise ValueError(f"{name} must be at least 1, got {getattr(config, name)}")
+
+
+def check_sizes(config: Config, sources: int, horizon: int) -> None:
     """Check that the sizes of a configuration fit together.
 
     Raises:
@@ -240,12 +266,12 @@ def validate(config: Config, sources: int, horizon: int) -> None:
     """
     steps = sources * config.envs_per_source
     rounds = config.model_updates_per_step * steps
+    needed = config.recent_steps + horizon * config.envs_per_source
 
     def require(holds: bool, message: str) -> None:
         if not holds:
             raise ValueError(message)
 
-    require(config.envs_per_source >= 1, f"envs_per_source must be at least 1, got {config.envs_per_source}")
     for name in ("warmup_steps", "refresh_every", "eval_every"):
         size = getattr(config, name)
         require(
@@ -268,22 +294,11 @@ def validate(config: Config, sources: int, horizon: int) -> None:
         rounds >= 1 and abs(rounds - round(rounds)) < 1e-6,
         f"model_updates_per_step must give a whole number of updates per iteration of {steps} steps, got {rounds:g}",
     )
-    needed = config.recent_steps + horizon * config.envs_per_source
     require(
         config.replay_steps >= needed and config.replay_steps % config.envs_per_source == 0,
         f"replay_steps must be a multiple of envs_per_source and hold recent_steps and one more horizon: at least {needed}, "
         f"got {config.replay_steps}",
     )
-    for name in (
-        "updates_per_step",
-        "replay_episodes",
-        "eval_episodes",
-        "probe_tasks",
-        "return_window",
-        "rollout_steps",
-        "n_step",
-    ):
-        require(getattr(config, name) >= 1, f"{name} must be at least 1, got {getattr(config, name)}")
 
 
 def diversity(w: Params) -> Any:

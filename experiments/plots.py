@@ -45,6 +45,21 @@ def learning_curves(
     figure.savefig(file, dpi=150)
 
 
+def comparison(file: Path, runs: Mapping[str, tuple[Int[np.ndarray, "T"], Curves]], *, title: str) -> None:
+    """The target return of several methods: every seed thin, the mean over seeds thick."""
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    for index, (method, (env_steps, curves)) in enumerate(runs.items()):
+        colour = f"C{index}"
+        for values in curves["target_return"]:
+            axes.plot(env_steps, values, color=colour, linewidth=0.8, alpha=0.4)
+        axes.plot(env_steps, curves["target_return"].mean(axis=0), color=colour, linewidth=2.5, label=method)
+    _decorate(axes, "target_return")
+    axes.legend()
+    figure.suptitle(title)
+    figure.savefig(file, dpi=150)
+
+
 def _decorate(axes: Axes, name: str) -> None:
     axes.set_title(PANELS[name], fontsize="medium")
     axes.set_xlabel("environment steps")

@@ -2,7 +2,8 @@
 
 * two CPU devices in each process, so that sharding is exercised for real;
 * a key used twice is an error (`jax_debug_key_reuse`);
-* mixing dtypes or ranks implicitly is an error (strict promotion).
+* mixing dtypes or ranks implicitly is an error (strict promotion);
+* programs are compiled without LLVM's optimisations: each runs a few times on small arrays, so compiling is what costs.
 
 The settings are global rather than per test, so that module-scoped fixtures compile under them too.  A test that has to
 break one says so with `@pytest.mark.relaxed("dtype")` (any of "dtype", "rank", "keys"), and why.
@@ -17,6 +18,7 @@ from contextlib import AbstractContextManager, ExitStack
 from typing import Any
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
 
 import hypothesis
 import jax

@@ -20,9 +20,6 @@ from apt_jax.networks import (
 from apt_jax.networks.encoders import observation_features, parameter_features
 from apt_jax.specs import Grid, Spec, Vector
 
-# Each program runs a few times on small arrays, so compile fast rather than run fast.
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-
 NUM_ACTIONS = 4
 NOISE_SIZE = 8
 OBS_SPEC: Spec = {"agent": Vector(2, 0, 9, "uint8"), "view": Grid(7, 7, 3), "objects": Vector(10, -9, 9, "int8")}
@@ -83,7 +80,7 @@ def encoder_size(*, vectors, grids):
 @functools.cache
 def initial_params(name):
     network, inputs = NETWORKS[name]
-    return jit(lambda key: network.init(key, **inputs(0)))(jax.random.key(0))
+    return jax.jit(lambda key: network.init(key, **inputs(0)))(jax.random.key(0))
 
 
 OBS_ENCODER = encoder_size(vectors=[2, 10], grids=[(3, 4)])
@@ -113,14 +110,14 @@ def test_leading_axes(name):
     batch = inputs(0, (2, 3))
     params = initial_params(name)
     apply = lambda batch: network.apply(params, **batch)  # noqa: E731
-    together, one_by_one = jit(lambda batch: (apply(batch), jax.vmap(jax.vmap(apply))(batch)))(batch)
+    together, one_by_one = jax.jit(lambda batch: (apply(batch), jax.vmap(jax.vmap(apply))(batch)))(batch)
     chex.assert_trees_all_close(together, one_by_one, atol=1e-5)
 
 
 def test_outputs_differ_with_every_input():
     network, inputs = NETWORKS["discriminator"]
     batch, other = inputs(0), inputs(5)
-    apply = jit(lambda batch: network.apply(initial_params("discriminator"), **batch)[1])
+    apply = jax.jit(lambda batch: network.apply(initial_params("discriminator"), **batch)[1])
     logit = apply(batch)
     for name in batch:
         changed = batch | {name: other[name] if name != "action" else (batch["action"] + 1) % NUM_ACTIONS}
@@ -164,13 +161,13 @@ def test_pool_weighs_the_initial_logit_as_one_of_all_encodings():
 GENERATOR = Generator(PARAM_SPEC)
 
 
-@jit
+@jax.jit
 def generate_train(variables, z):
     """The task parameters by the batch's statistics, and the moved running statistics."""
     return GENERATOR.apply(variables, z, train=True, mutable=["batch_stats"])
 
 
-@jit
+@jax.jit
 def generate(variables, z):
     return GENERATOR.apply(variables, z, train=False)
 
@@ -178,7 +175,7 @@ def generate(variables, z):
 @functools.cache
 def noise_and_variables():
     z = jax.random.normal(jax.random.key(0), (64, NOISE_SIZE))
-    return z, jit(lambda key: GENERATOR.init(key, z, train=True))(jax.random.key(1))
+    return z, jax.jit(lambda key: GENERATOR.init(key, z, train=True))(jax.random.key(1))
 
 
 @pytest.mark.parametrize("train", [True, False])
@@ -234,7 +231,7 @@ def test_generator_running_statistics_converge():
 def test_spectral_normalize_covers_every_kernel_of_the_discriminator():
     params = initial_params("discriminator")["params"]
     u = init_singular_vectors(jax.random.key(1), params)
-    step = jit(lambda u: spectral_normalize(params, u, bound=0.8))
+    step = jax.jit(lambda u: spectral_normalize(params, u, bound=0.8))
     for _ in range(100):
         normalized, u = step(u)
     kernels = [leaf for leaf in jax.tree.leaves(normalized) if leaf.ndim > 1]
@@ -273,11 +270,11 @@ def seed_losses():
 def test_stacked_seeds(init, loss):
     """Seeds side by side give what each gives alone, by matmuls only."""
     keys = jax.random.split(jax.random.key(3), 2)
-    stacked = jit(jax.vmap(init))(keys)
+    stacked = jax.jit(jax.vmap(init))(keys)
     stacked_grads = jax.vmap(jax.grad(loss))
     assert "conv_general_dilated" not in str(jax.make_jaxpr(stacked_grads)(stacked))
-    together = jit(stacked_grads)(stacked)
-    grads = jit(jax.grad(loss))
+    together = jax.jit(stacked_grads)(stacked)
+    grads = jax.jit(jax.grad(loss))
     for i in range(2):
         alone = grads(jax.tree.map(lambda x, i=i: x[i], stacked))
         chex.assert_trees_all_close(jax.tree.map(lambda x, i=i: x[i], together), alone, atol=1e-4, rtol=1e-3)

@@ -61,5 +61,5 @@ def spectral_normalize(
     new_u = {}
     for path, vector in u.items():
         sigma, new_u[path] = spectral_norm(leaves[path], vector)
-        leaves[path] = leaves[path] * jnp.minimum(1.0, bound / (sigma + _EPSILON))
+        leaves[path] = leaves[path] / jnp.maximum(1.0, sigma / bound)  # an infinite bound leaves value and gradient alone
     return unflatten_dict(leaves, sep=_SEPARATOR), new_u

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import learner, replay, workers
 from apt_jax.curricula import make_curriculum
-from apt_jax.curricula.apt_gen import as_instantiated
+from apt_jax.curricula.apt_gen import as_instantiated, pessimistic
 from apt_jax.curricula.base import GENERATED, TARGET
 from apt_jax.losses import discriminator_loss, generator_objective
 from apt_jax.networks import Discriminator, Generator, QNetwork, ValueNetwork, init_singular_vectors, pool, spectral_normalize
@@ -74,7 +74,7 @@ def iteration_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[s
 
     def propose(_: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         del iteration
-        return (), workers.assign(space, target, curriculum.propose(fixed, key, envs), envs)
+        return (), workers.assign(space, target, curriculum.propose(fixed, key, envs, hparams), envs)
 
     def step(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         state, *recorded = workers.step(space, state, fixed[0], fixed[1], iteration, key)
@@ -181,15 +181,16 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
 
         return descend(loss, params, opt_state), ()
 
-    def evaluate(params: Any, w: Any) -> Float[Array, "B"]:
-        return apply(value, params, as_instantiated(space.param_spec, w))
+    def evaluate(ensemble: Any, w: Any) -> Float[Array, "K B"]:
+        return jax.vmap(lambda params: apply(value, params, as_instantiated(space.param_spec, w)))(ensemble)
 
     def update_values(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         del key
         _, generated = _alternate(fixed, iteration)
 
         def loss(params: Any) -> tuple[Float[Array, ""], Any]:
-            errors = jnp.stack([evaluate(network, generated.w) - generated.episode_return for network in params])
+            outcome = generated.episode_return[None]  # what V1 learns costs the same as what V2 learns
+            errors = jnp.concatenate([evaluate(ensemble, generated.w) - outcome for ensemble in params])
             return jnp.sum(jnp.mean(errors**2, axis=1)), ()
 
         params, opt_state, _ = descend(loss, *state)
@@ -203,7 +204,7 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
             z = jax.random.normal(key, (config.model_batch_size, config.noise_size))
             variables = {"params": params, "batch_stats": batch_stats}
             w, updated = apply(generator, variables, z, train=True, mutable=["batch_stats"])
-            progress, value = (evaluate(network, w) for network in fixed)
+            progress, value = (pessimistic(evaluate(ensemble, w), hparams.pessimism) for ensemble in fixed)
             return -generator_objective(progress, value, beta=hparams.beta_init, delta=hparams.delta), updated["batch_stats"]
 
         return descend(loss, params, opt_state), ()
@@ -211,10 +212,12 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
     @jax.jit
     def init(key: Key[Array, ""]) -> Any:
         """States of the three updates; how well the networks are trained changes nothing in their cost."""
-        key_d, key_spectral, key_1, key_2, key_g = jax.random.split(key, 5)
+        key_d, key_spectral, key_value, key_g = jax.random.split(key, 4)
         obs, w = zeros_like(obs_struct(space.obs_spec)), zeros_like(param_struct(space.param_spec))
         params_d: Any = discriminator.init(key_d, obs, jnp.int32(0), reward=jnp.float32(0.0), next_obs=obs)
-        values = value.init(key_1, w), value.init(key_2, w)
+        keys = jax.random.split(key_value, (2, config.value_ensemble))
+        progress_value, return_value = (jax.vmap(lambda key: value.init(key, w))(ensemble) for ensemble in keys)
+        values = progress_value, return_value
         variables = generator.init(key_g, jnp.zeros((2, config.noise_size)), train=True)
         return (
             (params_d, _ADAM.init(params_d), init_singular_vectors(key_spectral, params_d)),
