@@ -129,7 +129,7 @@ def test_discriminator_methods_agree_with_call():
     batch = inputs(0, (5,))
     params = initial_params("discriminator")
 
-    @jit
+    @jax.jit
     def both_ways(batch):
         init_logit = network.apply(params, batch["obs"], method="score_init")
         step_logit = network.apply(params, **batch, method="score_step")
