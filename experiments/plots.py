@@ -40,7 +40,8 @@ def learning_curves(
         _decorate(axes, name)
         if name == "generated_episode_return" and "beta" in curves:
             _mark(axes, delta, "delta")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=8, fontsize="small")
+    handles = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=min(3 * len(names), 8), fontsize="small")
     figure.suptitle(title)
     figure.savefig(file, dpi=150)
 
