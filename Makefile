@@ -5,7 +5,8 @@ VENV ?= .venv
 # Test processes side by side; each holds its own JAX and compiles for itself.
 JOBS ?= 2
 PYTEST_ARGS ?= -n $(JOBS) --dist loadfile --durations=10
-ARGS ?= --space grid_world --target A --method apt_gen --preset fast --seeds 0 --run-dir runs/quickstart
+ARGS ?= --space grid_world --target A --method apt_gen --preset fast --seeds 0 --run-dir runs/quickstart \
+	$(if $(wildcard runs/quickstart/config.json),--resume)
 BENCHMARKS ?= $(basename $(notdir $(wildcard experiments/benchmarks/[a-z]*.py)))
 BENCH_ARGS ?=
 
@@ -21,7 +22,7 @@ help: ## Say what each command does.
 
 install: $(STAMP) ## Make .venv and install what constraints.txt pins; the other commands do it by themselves.
 
-train: $(STAMP) ## Train; ARGS="..." says what, by default a short APT-Gen run on the grid world.
+train: $(STAMP) ## Train; ARGS="..." says what, by default APT-Gen on Grid-World A, one seed; goes on where it was stopped.
 	$(BIN)/python -m experiments.train $(ARGS)
 
 test: lint ## Lint, type-check and run every test.

@@ -13,12 +13,12 @@ class HParams:
     """Numbers that may differ from lane to lane of one compiled program; every field is a float32 scalar once traced.
 
     Attributes:
-      learning_rate: Adam step size of the policy, > 0 (paper: 3e-4).
-      discriminator_learning_rate: Adam step size of the discriminator, > 0 (paper: 3e-4).
-      value_learning_rate: Adam step size of both value networks, > 0 (paper: 3e-4).
-      generator_learning_rate: Adam step size of the generator, > 0 (paper: 3e-4).
+      learning_rate: Adam step size of the policy, >= 0 (paper: 3e-4).
+      discriminator_learning_rate: Adam step size of the discriminator, >= 0 (paper: 3e-4).
+      value_learning_rate: Adam step size of both value networks, >= 0 (paper: 3e-4).
+      generator_learning_rate: Adam step size of the generator, >= 0 (paper: 3e-4).
       gamma: discount of the Q-learning target, in [0, 1].
-      target_rate: Polyak rate of the target network per policy update, in (0, 1].
+      target_rate: Polyak rate of the target network per policy update, in [0, 1].
       epsilon_start: exploration right after warm-up, in [0, 1].
       epsilon_end: exploration in the long run, in [0, 1].
       epsilon_steps: environment steps over which epsilon falls linearly, > 0.
@@ -27,7 +27,7 @@ class HParams:
       beta_init: beta at the start.
       beta_min: lower bound of beta (paper: 1/8).
       beta_max: upper bound of beta (paper: 8).
-      pessimism: standard deviations of the value ensemble taken off its mean, >= 0.
+      pessimism: standard deviations of the value ensemble taken off its mean, >= 0; nothing for an ensemble of one.
       value_weight_decay: decoupled weight decay of the value networks, per unit of their learning rate, >= 0.
       cell_noise: probability that a cell of a generated grid is played with a uniformly drawn category, in [0, 1] (paper: 0).
       vector_noise: standard deviation of the noise on generated vectors, as a share of their range, >= 0 (paper: 0).
@@ -55,6 +55,29 @@ class HParams:
     vector_noise: float = 0.0
     progress_temperature: float = 1.0
     spectral_bound: float = math.inf
+
+
+def check_hparams(hparams: HParams) -> None:
+    """Check the ranges that the fields' descriptions give; for plain numbers, before they are traced.
+
+    Raises:
+      ValueError: the field, its value, and what is allowed.
+    """
+    positive = ("epsilon_steps", "beta_min", "progress_temperature", "spectral_bound")
+    not_negative = ("tolerance", "pessimism", "value_weight_decay", "vector_noise")
+    rates = ("learning_rate", "discriminator_learning_rate", "value_learning_rate", "generator_learning_rate")
+    shares = ("gamma", "target_rate", "epsilon_start", "epsilon_end", "cell_noise")
+    ranges = {
+        **dict.fromkeys(positive, (math.ulp(0.0), math.inf, "above 0")),
+        **dict.fromkeys(not_negative + rates, (0.0, math.inf, "at least 0")),
+        **dict.fromkeys(shares, (0.0, 1.0, "in [0, 1]")),
+    }
+    for name, (low, high, allowed) in ranges.items():
+        value = getattr(hparams, name)
+        if not low <= value <= high:
+            raise ValueError(f"{name} must be {allowed}, got {value:g}")
+    if not hparams.beta_min <= hparams.beta_init <= hparams.beta_max:
+        raise ValueError(f"beta_init must lie in [beta_min, beta_max], got {hparams.beta_init:g}")
 
 
 @dataclass(frozen=True)

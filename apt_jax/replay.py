@@ -204,13 +204,13 @@ def sample_rollouts(
       iteration: the latest iteration written.
       steps: transitions drawn (with replacement) from each episode.
     """
-    episodes = jax.tree.map(lambda ring: ring[source], replay.episodes)
-    slots = episodes.end.shape[0]
+    slots = replay.episodes.end.shape[1]
     columns = replay.transitions.action.shape[2]
     key_episode, key_step = jax.random.split(key)
-    count = jnp.sum(episodes.end > iteration - recent, dtype=jnp.int32)
+    count = jnp.sum(replay.episodes.end[source] > iteration - recent, dtype=jnp.int32)
     back = jax.random.randint(key_episode, (batch_size,), 0, jnp.maximum(count, 1))
-    picked = jax.tree.map(lambda ring: ring[(replay.finished[source] - 1 - back) % slots], episodes)
+    slot = (replay.finished[source] - 1 - back) % slots
+    picked = jax.tree.map(lambda ring: ring[source, slot], replay.episodes)
     start = picked.end - picked.length + 1
     offset = jax.random.randint(key_step, (batch_size, steps), 0, picked.length[:, None])
 

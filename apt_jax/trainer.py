@@ -9,19 +9,20 @@ The caller batches over seeds and hyper-parameters and jits (`apt_jax.lanes`).  
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import evaluation, learner, replay, workers
 from apt_jax.config import Config, HParams
 from apt_jax.curricula import make_curriculum
-from apt_jax.curricula.base import GENERATED, TARGET, Metrics
+from apt_jax.curricula.base import GENERATED, TARGET, Metrics, no_update
 from apt_jax.networks import QNetwork
-from apt_jax.specs import Obs, Params
+from apt_jax.specs import Grid, Obs, Params, Spec, Vector, param_struct
 from apt_jax.task_space import TaskSpace
 
 
@@ -81,9 +82,11 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
       ValueError: an unknown method, or sizes that do not fit together (what, and what is allowed).
     """
     check_counts(config)
+    check_target(space, target)
     curriculum = make_curriculum(space, config)
     sources = 2 if curriculum.generates else 1
-    check_sizes(config, sources, space.horizon)
+    learns = curriculum.update is not no_update
+    check_sizes(config, sources, space.horizon, learns)
     network = QNetwork(space.obs_spec, space.num_actions)
     envs = config.envs_per_source
     steps = sources * envs
@@ -114,7 +117,9 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             workers=workers.start(space, assign(target, curriculum_state, key_assign, hparams), key_start),
         )
 
-    def collect(state: TrainState, clock: Clock, key: Key[Array, ""], epsilon: Any, hparams: HParams) -> TrainState:
+    def collect(
+        state: TrainState, clock: Clock, key: Key[Array, ""], epsilon: Float[Array, ""] | float, hparams: HParams
+    ) -> TrainState:
         """Act, step and write: one step of every environment.  All writes come before any read of the rings."""
         key_act, key_assign, key_step = jax.random.split(key, 3)
         action = learner.epsilon_greedy(network, state.learner.params, state.workers.obs, key_act, epsilon)
@@ -150,7 +155,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             curriculum_state, metrics = curriculum.update(curriculum_state, key_update, state.replay, clock.iteration, hparams)
             return (curriculum_state, key), metrics
 
-        rounds = round(config.model_updates_per_step * steps)
+        rounds = round(config.model_updates_per_step * steps) if learns else 0
         (curriculum_state, _), metrics = jax.lax.scan(update, (state.curriculum, key), length=rounds)
         return state._replace(curriculum=curriculum_state), _mean(metrics)
 
@@ -206,7 +211,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             metrics |= {
                 "probe_return": jnp.mean(probe.episode_return),
                 "probe_success": jnp.mean(probe.success.astype(jnp.float32)),
-                "probe_diversity": diversity(w),
+                **diversity(space.param_spec, w),
                 **{f"probe_{name}": jnp.nanmean(values) for name, values in descriptions.items()},
                 **curriculum.report(state.curriculum, w, probe.episode_return),
             }
@@ -258,7 +263,7 @@ def check_counts(config: Config) -> None:
             raise ValueError(f"{name} must be at least 1, got {getattr(config, name)}")
 
 
-def check_sizes(config: Config, sources: int, horizon: int) -> None:
+def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> None:
     """Check that the sizes of a configuration fit together.
 
     Raises:
@@ -266,7 +271,8 @@ def check_sizes(config: Config, sources: int, horizon: int) -> None:
     """
     steps = sources * config.envs_per_source
     rounds = config.model_updates_per_step * steps
-    needed = config.recent_steps + horizon * config.envs_per_source
+    longest = horizon * config.envs_per_source
+    needed = config.recent_steps + longest
 
     def require(holds: bool, message: str) -> None:
         if not holds:
@@ -291,8 +297,17 @@ def check_sizes(config: Config, sources: int, horizon: int) -> None:
         f"warmup_steps must let every environment finish an episode: at least {horizon * steps}, got {config.warmup_steps}",
     )
     require(
-        rounds >= 1 and abs(rounds - round(rounds)) < 1e-6,
+        not learns or (rounds >= 1 and abs(rounds - round(rounds)) < 1e-6),
         f"model_updates_per_step must give a whole number of updates per iteration of {steps} steps, got {rounds:g}",
+    )
+    require(
+        config.recent_steps >= longest,
+        f"recent_steps must hold one horizon of every environment: at least {longest}, got {config.recent_steps}",
+    )
+    require(
+        config.replay_episodes >= max(config.return_window, config.envs_per_source),
+        f"replay_episodes must be at least return_window={config.return_window} and envs_per_source={config.envs_per_source}, "
+        f"got {config.replay_episodes}",
     )
     require(
         config.replay_steps >= needed and config.replay_steps % config.envs_per_source == 0,
@@ -301,9 +316,39 @@ def check_sizes(config: Config, sources: int, horizon: int) -> None:
     )
 
 
-def diversity(w: Params) -> Any:
-    """Mean standard deviation of a task parameter's components over tasks (leaves [n, ...])."""
-    return jnp.mean(jnp.concatenate([jnp.std(leaf, axis=0).ravel() for leaf in jax.tree.leaves(w)]))
+def check_target(space: TaskSpace, target: Any) -> None:
+    """Check that a target is a task of the shapes and dtypes that the space's tasks have.
+
+    Raises:
+      ValueError: where it differs; or a space with more actions than the replay can store.
+    """
+    if space.num_actions > 256:
+        raise ValueError(f"num_actions must be at most 256, got {space.num_actions}")
+    expected = jax.eval_shape(space.instantiate, param_struct(space.param_spec))
+    given = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, target))
+    if given != expected:
+        raise ValueError(f"the target must look like a task of {space.name}, {expected}, got {given}")
+
+
+def diversity(spec: Spec, w: Params) -> Metrics:
+    """How much proposed tasks differ (leaves [n, ...]), per modality.
+
+    `probe_entropy_*` of a grid: mean entropy of a cell's category over tasks, as a share of the largest.  `probe_spread_*` of a
+    vector: mean standard deviation of a number over tasks, as a share of its range.
+    """
+
+    def entropy(scores: Array, categories: int) -> Array:
+        share = jnp.mean(jax.nn.one_hot(jnp.argmax(scores, axis=-1), categories), axis=0)
+        return jnp.mean(jnp.sum(jax.scipy.special.entr(share), axis=-1)) / math.log(categories)
+
+    metrics = {}
+    for name, modality in spec.items():
+        match modality:
+            case Grid():
+                metrics[f"probe_entropy_{name}"] = entropy(w[name], modality.categories)
+            case Vector():
+                metrics[f"probe_spread_{name}"] = jnp.mean(jnp.std(w[name], axis=0)) / (modality.high - modality.low)
+    return metrics
 
 
 def _sources(rings: replay.Replay, window: int) -> Metrics:

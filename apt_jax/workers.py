@@ -42,7 +42,7 @@ def assign(space: TaskSpace, target: Any, w: Params | None, envs: int) -> Assign
         return Assignment(targets, no_w)
     generated = Assignment(jax.vmap(space.instantiate)(w), w)
     stacked = jax.tree.map(lambda x: x[None], generated)
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b.astype(a.dtype)]), Assignment(targets, no_w), stacked)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), Assignment(targets, no_w), stacked)
 
 
 def start(space: TaskSpace, assignment: Assignment, key: Key[Array, ""]) -> Workers:

@@ -16,6 +16,7 @@ Image = UInt8[np.ndarray, "H W 3"]
 
 PANELS = {
     "target_return": "Return on the target",
+    "target_return_raw": "The same before the restore rule",
     "generated_episode_return": "Return on generated tasks",
     "beta": "Beta",
     "probe_solution_length": "Shortest solution of generated tasks",
@@ -46,18 +47,19 @@ def learning_curves(
     figure.savefig(file, dpi=150)
 
 
-def comparison(file: Path, runs: Mapping[str, tuple[Int[np.ndarray, "T"], Curves]], *, title: str) -> None:
-    """The target return of several methods: every seed thin, the mean over seeds thick."""
+def comparison(file: Path, runs: Mapping[str, tuple[Int[np.ndarray, "T"], Curves]]) -> None:
+    """The target return of several runs: every seed thin, the mean over seeds thick, a standard deviation shaded."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
-    for index, (method, (env_steps, curves)) in enumerate(runs.items()):
+    for index, (name, (env_steps, curves)) in enumerate(runs.items()):
         colour = f"C{index}"
+        mean, deviation = curves["target_return"].mean(axis=0), curves["target_return"].std(axis=0)
+        axes.fill_between(env_steps, mean - deviation, mean + deviation, color=colour, alpha=0.1, linewidth=0)
         for values in curves["target_return"]:
             axes.plot(env_steps, values, color=colour, linewidth=0.8, alpha=0.4)
-        axes.plot(env_steps, curves["target_return"].mean(axis=0), color=colour, linewidth=2.5, label=method)
+        axes.plot(env_steps, mean, color=colour, linewidth=2.5, label=name)
     _decorate(axes, "target_return")
     axes.legend()
-    figure.suptitle(title)
     figure.savefig(file, dpi=150)
 
 
@@ -69,7 +71,7 @@ def _decorate(axes: Axes, name: str) -> None:
     if name == "beta":
         axes.set_yscale("log", base=2)
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    if name.endswith("return"):  # at least from 0 to 1, so that noise around failure looks like noise
+    if "return" in name:  # at least from 0 to 1, so that noise around failure looks like noise
         low, high = axes.get_ylim()
         axes.set_ylim(min(low, 0.0), max(high, 1.0))
 

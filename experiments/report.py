@@ -21,7 +21,7 @@ class Report:
     """Compare runs on the same target.
 
     Attributes:
-      runs: run directories; a run is called by its method.
+      runs: run directories; a run is called by its directory's name.
       figure: where to draw the target return of every seed; not drawn by default.
     """
 
@@ -32,29 +32,25 @@ class Report:
 def main() -> int:
     """The command line."""
     report = tyro.cli(Report, prog="python -m experiments.report", description=__doc__)
-    runs = {path: (run_dir.read_config(path), *run_dir.read_metrics(path)) for path in report.runs}
-    print(
-        "| method | target | steps | final return by seed (mean) | the same before the restore rule | first steps above 0.9 |"
-    )
-    print("|---|---|---|---|---|---|")
-    for config, env_steps, curves in runs.values():
-        print(row(config["config"]["method"], config["target"], env_steps, curves))
+    runs = {path.name: run_dir.read_metrics(path) for path in report.runs}
+    print("| run | steps | final return by seed (mean ± deviation) | before the restore rule | first steps above 0.9 |")
+    print("|---|---|---|---|---|")
+    for name, (env_steps, curves) in runs.items():
+        print(row(name, env_steps, curves))
     if report.figure:
         report.figure.parent.mkdir(parents=True, exist_ok=True)
-        methods = {config["config"]["method"]: (env_steps, curves) for config, env_steps, curves in runs.values()}
-        plots.comparison(report.figure, methods, title=f"Target {' '.join({c['target'] for c, _, _ in runs.values()})}")
+        plots.comparison(report.figure, runs)
     return 0
 
 
-def row(method: str, target: str, env_steps: Int[np.ndarray, "T"], curves: run_dir.Curves) -> str:
+def row(name: str, env_steps: Int[np.ndarray, "T"], curves: run_dir.Curves) -> str:
     """One line of the table; a dash where a seed never got there."""
     final, raw = curves["target_return"][:, -1], curves["target_return_raw"][:, -1]
     firsts = [first_above(env_steps, values) for values in curves["target_return_raw"]]
     cells = (
-        method,
-        target,
+        name,
         f"{env_steps[-1]:,}",
-        f"{_numbers(final)} ({final.mean():.2f})",
+        f"{_numbers(final)} ({final.mean():.2f} ± {final.std():.2f})",
         _numbers(raw),
         " ".join("-" if step is None else f"{step / 1000:g}k" for step in firsts),
     )

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 import shutil
 from collections.abc import Mapping, Sequence
@@ -91,8 +92,19 @@ class RunDir:
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Writes a JSON file whole or not at all."""
         temporary = self.path / f"{name}.tmp"
-        temporary.write_text(json.dumps(content, indent=2, default=str) + "\n")
+        temporary.write_text(json.dumps(_finite(content), indent=2, default=str, allow_nan=False) + "\n")
         temporary.replace(self.path / name)
+
+
+def _finite(content: Any) -> Any:
+    """JSON knows neither infinity nor NaN: they become strings, which `float` reads."""
+    match content:
+        case Mapping():
+            return {name: _finite(value) for name, value in content.items()}
+        case float() if not math.isfinite(content):
+            return str(content)
+        case _:
+            return content
 
 
 def read_config(path: Path) -> dict[str, Any]:

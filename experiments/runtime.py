@@ -24,6 +24,7 @@ def setup(cpu_devices: int | None = None) -> None:
     jax.config.update("jax_num_cpu_devices", cpu_devices or _cores())
     if not jax.config.values["jax_compilation_cache_dir"]:  # JAX itself reads JAX_COMPILATION_CACHE_DIR
         jax.config.update("jax_compilation_cache_dir", str(_cache_root() / "apt_jax" / "compiled"))
+    jax.config.update("jax_default_matmul_precision", "highest")  # accelerators would round float32 inputs
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _MIN_COMPILE_SECONDS)
 
 

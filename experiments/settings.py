@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from apt_jax.config import PRESETS, Config, HParams
+from apt_jax.config import PRESETS, Config, HParams, check_hparams
 from apt_jax.lanes import Layout
 from experiments import run_dir
 from experiments.errors import UsageError
@@ -27,8 +27,8 @@ class Experiment:
 
     Attributes:
       space: the task space.
-      target: the target task's name in the space.
-      target_file: a file that describes the target task, instead of a name.
+      target: the target task's name in the space, or a file that describes it.
+      target_file: a file that describes the target task, whatever `target` says.
       seeds: one lane of the compiled program each.
       env_steps: environment steps of all sources together, warm-up included.
       config: sizes and names; a change compiles a new program.
@@ -113,6 +113,8 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
     experiment, session = tyro.cli(train, args=args, prog="python -m experiments.train", config=(tyro.conf.FlagCreatePairsOff,))
     if session.method:
         experiment = dataclasses.replace(experiment, config=dataclasses.replace(experiment.config, method=session.method))
+    if not experiment.target_file and Path(experiment.target).is_file():
+        experiment = dataclasses.replace(experiment, target_file=Path(experiment.target))
     check(experiment, session)
     if saved:
         check_resumable(saved, experiment)
@@ -127,6 +129,10 @@ def check(experiment: Experiment, session: Session) -> None:
         raise UsageError(f"--seeds must not be negative, got {min(experiment.seeds)}")
     if experiment.target_file and not experiment.target_file.is_file():
         raise UsageError(f"--target-file {experiment.target_file} is no file")
+    try:
+        check_hparams(experiment.hparams)
+    except ValueError as error:
+        raise UsageError(f"--hparams: {error}") from error
     for name in ("devices", "checkpoint_every"):
         value = getattr(session, name)
         if value is not None and value < 1:
@@ -157,7 +163,7 @@ def load(directory: Path) -> Experiment:
                 "target_file": directory / saved["target_file"] if saved["target_file"] else None,
                 "seeds": tuple(saved["seeds"]),
                 "config": Config(**saved["config"]),
-                "hparams": HParams(**saved["hparams"]),
+                "hparams": HParams(**{name: float(value) for name, value in saved["hparams"].items()}),
             }
         )
     except (KeyError, TypeError) as error:

@@ -19,15 +19,17 @@ class Times:
 
     Attributes:
       before: wall seconds of earlier sessions of the same run, until the checkpoint.
-      compile: ahead-of-time compilation of the chunk.
+      compile: ahead-of-time compilation of warm-up and chunk.
       training: chunks, and nothing else.
       trained_steps: environment steps of one seed in these chunks.
+      about: versions, device and commit, as they are when the session starts.
     """
 
     before: float
     compile: float = 0.0
     training: float = 0.0
     trained_steps: int = 0
+    about: dict[str, object] = field(default_factory=runtime.describe)
     _began: float = field(default_factory=time.monotonic)
 
     @property
@@ -51,7 +53,7 @@ def summarise(path: Path, experiment: Experiment, times: Times) -> dict[str, obj
             str(seed): {
                 "final_target_return": _number(curves["target_return"][lane, -1]),
                 "final_target_return_raw": _number(curves["target_return_raw"][lane, -1]),
-                "best_target_return": _number(curves["target_return"][lane].max()),
+                "best_target_return": _number(curves["target_return_raw"][lane].max()),
             }
             for lane, seed in enumerate(experiment.seeds)
         },
@@ -60,7 +62,7 @@ def summarise(path: Path, experiment: Experiment, times: Times) -> dict[str, obj
         "compile_seconds": round(times.compile, 2),
         "steps_per_second_per_seed": speed and round(speed, 1),
         "steps_per_second_all_seeds": speed and round(speed * len(experiment.seeds), 1),
-        **runtime.describe(),
+        **times.about,
     }
 
 

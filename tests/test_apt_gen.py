@@ -35,7 +35,7 @@ class Bowl(nn.Module):
 def experience():
     """A replay with finished episodes of both sources."""
     states, clock, _ = run(dataclasses.replace(CONFIG, method="random"), [0])
-    return jax.tree.map(lambda x: x[0], states.replay), clock.iteration
+    return jax.tree.map(lambda x: x[0], states.replay), clock.iteration - 1
 
 
 @pytest.mark.parametrize(("beta", "optimum"), [(0.125, 2.667), (3.0, 6.5), (8.0, 7.333)])
@@ -89,6 +89,13 @@ def test_values_see_the_task_that_is_played():
     weights = jnp.array([1.0, 2.0, 3.0])
     gradient = jax.grad(lambda s: jnp.sum(apt_gen.as_instantiated(spec, {"paint": s})["paint"] * weights[None, None]))(scores)
     np.testing.assert_allclose(gradient[0, 0], weights)
+
+
+def test_pessimism_takes_deviations_off_the_mean_and_has_a_gradient_where_all_agree():
+    np.testing.assert_allclose(apt_gen.pessimistic(jnp.array([[1.0], [3.0]]), 0.5), [1.5], rtol=1e-3)
+    np.testing.assert_allclose(apt_gen.pessimistic(jnp.array([[2.0]]), 0.5), [2.0])
+    gradient = jax.grad(lambda values: apt_gen.pessimistic(values, 1.0).sum())(jnp.ones((4, 3)))
+    assert np.isfinite(gradient).all()
 
 
 def test_correlation():

@@ -13,7 +13,7 @@ import pytest
 from apt_jax import checkpoint
 from apt_jax.config import Config, HParams
 from apt_jax.lanes import make_program, stack_hparams
-from apt_jax.trainer import Clock, make_trainer
+from apt_jax.trainer import Clock, diversity, make_trainer
 from tests.corridor import Corridor
 
 SPACE = Corridor()
@@ -81,6 +81,21 @@ def test_metrics_are_finite_and_the_clock_counts_every_source(method):
         for name, value in metrics.items():
             assert value.shape == (2,), name
             assert np.isfinite(value).all(), name
+
+
+def test_a_target_of_another_shape_is_refused():
+    with pytest.raises(ValueError, match="must look like a task of corridor"):
+        make_trainer(SPACE, np.zeros(3, np.int32), CONFIG)
+
+
+def test_diversity_sees_a_collapse_of_one_modality():
+    spec = SPACE.param_spec
+    w = jax.vmap(SPACE.sample_uniform)(jax.random.split(jax.random.key(0), 512))
+    random = diversity(spec, w)
+    np.testing.assert_allclose(random["probe_entropy_paint"], 1.0, atol=0.01)
+    np.testing.assert_allclose(random["probe_spread_goal"], 12**-0.5, atol=0.02)
+    collapsed = diversity(spec, {**w, "paint": jnp.broadcast_to(w["paint"][:1], w["paint"].shape)})
+    np.testing.assert_allclose(collapsed["probe_entropy_paint"], 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("layout", ["map", "vmap"])
@@ -166,7 +181,7 @@ def test_every_method_learns_a_shorter_corridor(method):
     states, clock = compiled.warmup(states, Clock.start(), lanes)
     for _ in range(8):
         states, clock, metrics = compiled.chunk(states, clock, lanes)
-    np.testing.assert_allclose(metrics["target_return"], 0.96, atol=1e-5)
+    np.testing.assert_allclose(metrics["target_return_raw"], 0.96, atol=1e-5)
 
 
 def test_resuming_from_a_checkpoint_equals_never_having_stopped(tmp_path):
@@ -189,7 +204,10 @@ def test_resuming_from_a_checkpoint_equals_never_having_stopped(tmp_path):
     [
         ({"method": "apt-gen"}, "unknown method 'apt-gen'; closest is 'apt_gen'"),
         ({"batch_size": 15}, "batch_size .* 2 sources, got 15"),
-        ({"eval_every": 50}, "eval_every must be a multiple of refresh_every=20, got 50|multiple of the 4"),
+        ({"eval_every": 44}, "eval_every must be a multiple of refresh_every=20, got 44"),
+        ({"eval_every": 50}, "eval_every .* 4 environment steps"),
+        ({"recent_steps": 20}, "recent_steps .* at least 24, got 20"),
+        ({"replay_episodes": 5}, "replay_episodes .* return_window=10"),
         ({"refresh_every": 18}, "refresh_every .* 4 environment steps"),
         ({"warmup_steps": 40}, "warmup_steps .* at least 48, got 40"),
         ({"model_updates_per_step": 0.3}, "whole number of updates"),

@@ -242,7 +242,8 @@ def pessimistic(values: Float[Array, "K n"], pessimism: Float[Array, ""] | float
     """Mean of an ensemble less `pessimism` standard deviations: where the networks disagree there was little experience."""
     if values.shape[0] == 1:
         return values[0]
-    return jnp.mean(values, axis=0) - pessimism * jnp.std(values, axis=0)
+    spread = jnp.sqrt(jnp.var(values, axis=0) + 1e-8)  # the root has no gradient at zero
+    return jnp.mean(values, axis=0) - pessimism * spread
 
 
 def correlation(a: Float[Array, "n"], b: Float[Array, "n"]) -> Float[Array, ""]:
