@@ -92,6 +92,8 @@ class Config:
       warmup_steps: steps collected by a uniformly random policy before any update (paper: 10,000).
       updates_per_step: policy updates per environment step (paper: 10).
       batch_size: transitions per policy update, drawn equally from the sources (paper: 128).
+      episode_share: share of a policy update's transitions drawn by episode, so that solved episodes, which are short, weigh as
+        much as those that run into the horizon; the others are drawn uniformly, in [0, 1] (the paper names none: 0).
       n_step: rewards summed up before the Q-learning target bootstraps (the paper names none: 1).
       replay_steps: capacity of each source's replay, in steps of that source.
       replay_episodes: capacity of each source's ring of finished episodes.
@@ -99,6 +101,9 @@ class Config:
       model_batch_size: rollouts per source in such an update (paper: 128).
       rollout_steps: transitions of each rollout that the discriminator sees in one update.
       recent_steps: discriminator and values learn from the latest so many steps of each source (paper: 10,000).
+      relative_progress: whether V1 learns from logits centred and scaled to unit spread over the batch, so that progress weighs
+        the same against return however sure the discriminator is (paper: no).
+      blank_bias: head start of category 0 in the generator's initial grids, in standard deviations of the scores (paper: 0).
       value_ensemble: networks behind each of V1 and V2, whose estimate is their mean less `pessimism` deviations (paper: 1).
       noise_size: length of the generator's noise z.
       refresh_every: steps between updates of beta (paper: 500).
@@ -113,6 +118,7 @@ class Config:
     warmup_steps: int = 10_000
     updates_per_step: int = 10
     batch_size: int = 128
+    episode_share: float = 0.0
     n_step: int = 1
     replay_steps: int = 100_000
     replay_episodes: int = 10_000
@@ -120,6 +126,8 @@ class Config:
     model_batch_size: int = 128
     rollout_steps: int = 4
     recent_steps: int = 10_000
+    relative_progress: bool = False
+    blank_bias: float = 0.0
     value_ensemble: int = 1
     noise_size: int = 32
     refresh_every: int = 500
@@ -132,14 +140,25 @@ class Config:
 PRESETS: dict[str, tuple[Config, HParams]] = {
     "paper": (Config(), HParams()),
     "fast": (
-        Config(envs_per_source=5, updates_per_step=2, model_updates_per_step=0.2, model_batch_size=64, value_ensemble=4),
+        Config(
+            envs_per_source=5,
+            updates_per_step=2,
+            episode_share=0.5,
+            model_updates_per_step=0.2,
+            model_batch_size=64,
+            recent_steps=5_000,
+            relative_progress=True,
+            blank_bias=2.0,
+            value_ensemble=4,
+        ),
         HParams(
             learning_rate=1e-3,
+            generator_learning_rate=7e-4,
             gamma=0.97,
             value_weight_decay=10.0,
-            cell_noise=0.1,
+            cell_noise=0.03,
             vector_noise=0.05,
-            progress_temperature=4.0,
+            progress_temperature=2.0,
             spectral_bound=0.8,
         ),
     ),

@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from apt_jax.specs import Obs
+from apt_jax.replay import Rollouts, Transition
+from apt_jax.specs import Obs, Params
 from apt_jax.task_space import TaskSpace
 
 Policy = Callable[[Obs, Key[Array, ""]], Int[Array, "n"]]
@@ -34,22 +35,43 @@ class _Playing(NamedTuple):
     outcome: Outcome
 
 
-def play(space: TaskSpace, tasks: Any, policy: Policy, key: Key[Array, ""]) -> Outcome:
-    """One episode on each task (leaves [n, ...]), all side by side for `space.horizon` steps; consumes `key`."""
+def play(space: TaskSpace, tasks: Any, policy: Policy, key: Key[Array, ""]) -> tuple[Outcome, Transition]:
+    """One episode on each task (leaves [n, ...]), all side by side for `space.horizon` steps; consumes `key`.
+
+    Returns:
+      The outcomes, and the transitions with leaves [n, horizon, ...], of which the first `length` belong to the episode.
+    """
     n = jax.tree.leaves(tasks)[0].shape[0]
     key_reset, key_policy = jax.random.split(key)
     state, obs = jax.vmap(space.reset)(jax.random.split(key_reset, n), tasks)
 
-    def step(carry: _Playing, _: None) -> tuple[_Playing, None]:
+    def step(carry: _Playing, _: None) -> tuple[_Playing, Transition]:
         key, key_action = jax.random.split(carry.key)
-        out = jax.vmap(space.step)(carry.state, policy(carry.obs, key_action), tasks)
+        action = policy(carry.obs, key_action)
+        out = jax.vmap(space.step)(carry.state, action, tasks)
+        done = out.terminated | out.truncated
         outcome = Outcome(
             episode_return=carry.outcome.episode_return + jnp.where(carry.over, 0.0, out.reward),
             success=carry.outcome.success | (out.success & ~carry.over),
             length=carry.outcome.length + jnp.where(carry.over, 0, 1),
         )
-        return _Playing(key, out.state, out.obs, carry.over | out.terminated | out.truncated, outcome), None
+        transition = Transition(carry.obs, action, out.reward, out.obs, out.terminated, done)
+        return _Playing(key, out.state, out.obs, carry.over | done, outcome), transition
 
     start = Outcome(jnp.zeros(n), jnp.zeros(n, bool), jnp.zeros(n, jnp.int32))
     playing = _Playing(key_policy, state, obs, jnp.zeros(n, bool), start)
-    return jax.lax.scan(step, playing, length=space.horizon)[0].outcome
+    played, transitions = jax.lax.scan(step, playing, length=space.horizon)
+    return played.outcome, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), transitions)
+
+
+def sample_rollouts(w: Params, outcome: Outcome, transitions: Transition, key: Key[Array, ""], *, steps: int) -> Rollouts:
+    """What `play` returned for tasks `w`, with `steps` transitions of each drawn with replacement; consumes `key`."""
+    n = outcome.length.shape[0]
+    at = jax.random.randint(key, (n, steps), 0, outcome.length[:, None])
+    return Rollouts(
+        w=w,
+        initial_obs=jax.tree.map(lambda x: x[:, 0], transitions.obs),
+        steps=jax.tree.map(lambda x: x[jnp.arange(n, dtype=jnp.int32)[:, None], at], transitions),
+        length=outcome.length,
+        episode_return=outcome.episode_return,
+    )

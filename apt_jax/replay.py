@@ -152,25 +152,31 @@ def sample_transitions(
     batch_size: int,
     n_step: int,
     gamma: Float[Array, ""] | float,
+    episode_share: float = 0.0,
+    horizon: int = 0,
 ) -> Batch:
-    """`batches` of `batch_size` n-step transitions, uniformly and in equal shares from the sources; consumes `key`.
+    """`batches` of `batch_size` n-step transitions in equal shares from the sources; consumes `key`.
 
     A transition stops early where its episode ends and at the latest step written: it then spans fewer than `n_step` steps.
 
     Args:
       iteration: the latest iteration written.
+      episode_share: share drawn as a step of a uniformly drawn finished episode, so that short episodes, which are mostly the
+        solved ones, weigh as much as those that run into the horizon; the others are drawn uniformly from all steps.
+      horizon: the longest that an episode can be, for `episode_share`.
 
     Returns:
       Leaves [batches, batch_size, ...].
     """
     sources, envs, columns = replay.transitions.action.shape
     share = batch_size // sources
-    key_env, key_age = jax.random.split(key)
-    shape = (sources, batches, share)
-    env = jax.random.randint(key_env, shape, 0, envs)
-    age = jax.random.randint(key_age, shape, 0, jnp.minimum(iteration + 1, columns))
+    key_step, key_episode = jax.random.split(key)
+    from_episodes = round(episode_share * share)
+    drawn = [_draw_steps(replay, key_step, iteration, (sources, batches, share - from_episodes))]
+    if from_episodes:
+        drawn.append(_draw_by_episode(replay, key_episode, iteration, (sources, batches, from_episodes), horizon))
+    env, first = (jnp.concatenate(parts, axis=-1) for parts in zip(*drawn, strict=True))
     row = (jnp.arange(sources, dtype=jnp.int32)[:, None, None] * envs + env) * columns
-    first = iteration - age
 
     # One flat index over sources, environments and columns: a single leading index is the cheapest gather on every backend.
     def gather(ring: Array, at: Int[Array, "S batches share"]) -> Array:
@@ -178,7 +184,7 @@ def sample_transitions(
 
     rings = replay.transitions
     reward = gather(rings.reward, first)
-    discount = jnp.full(shape, gamma, jnp.float32)
+    discount = jnp.full(first.shape, gamma, jnp.float32)
     last = first
     for _ in range(n_step - 1):
         goes_on = ~gather(rings.done, last) & (last < iteration)
@@ -193,6 +199,36 @@ def sample_transitions(
         discount=jnp.where(gather(rings.terminated, last), 0.0, discount),
     )
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(batches, sources * share, *x.shape[3:]), batch)
+
+
+Positions = tuple[Int[Array, "S batches n"], Int[Array, "S batches n"]]
+"""Environment and iteration of steps of every source."""
+
+
+def _draw_steps(replay: Replay, key: Key[Array, ""], iteration: Int[Array, ""], shape: tuple[int, int, int]) -> Positions:
+    """Steps drawn uniformly from the ring; consumes `key`."""
+    _, envs, columns = replay.transitions.action.shape
+    key_env, key_age = jax.random.split(key)
+    env = jax.random.randint(key_env, shape, 0, envs)
+    age = jax.random.randint(key_age, shape, 0, jnp.minimum(iteration + 1, columns))
+    return env, iteration - age
+
+
+def _draw_by_episode(
+    replay: Replay, key: Key[Array, ""], iteration: Int[Array, ""], shape: tuple[int, int, int], horizon: int
+) -> Positions:
+    """Finished episodes drawn uniformly, and of each a step drawn uniformly; consumes `key`."""
+    columns = replay.transitions.action.shape[2]
+    slots = replay.episodes.end.shape[1]
+    key_episode, key_step = jax.random.split(key)
+    # The first steps of an episode that ended longer ago may be overwritten.
+    count = jnp.sum(replay.episodes.end > iteration - columns + horizon, axis=1, dtype=jnp.int32)[:, None, None]
+    back = jax.random.randint(key_episode, shape, 0, jnp.maximum(count, 1))
+    slot = (replay.finished[:, None, None] - 1 - back) % slots
+    source = jnp.arange(shape[0], dtype=jnp.int32)[:, None, None]
+    length = replay.episodes.length[source, slot]
+    age = jax.random.randint(key_step, shape, 0, length)
+    return replay.episodes.env[source, slot], replay.episodes.end[source, slot] - age
 
 
 def sample_rollouts(
@@ -228,13 +264,16 @@ def sample_rollouts(
     )
 
 
-def recent_outcome(replay: Replay, *, source: int, window: int) -> dict[str, Any]:
-    """Mean return and success rate of a source's last `window` finished episodes; NaN before the first."""
+def recent_outcome(replay: Replay, *, source: int, window: int, since: int = 0) -> dict[str, Any]:
+    """Mean return, success rate and length of a source's last `window` episodes that ended at or after iteration `since`.
+
+    NaN before the first.
+    """
     slots = replay.episodes.env.shape[1]
     count = jnp.minimum(replay.finished[source], window)
     back = jnp.arange(window, dtype=jnp.int32)
     slot = (replay.finished[source] - 1 - back) % slots
-    valid = back < count
+    valid = (back < count) & (replay.episodes.end[source, slot] >= since)
 
     def mean(values: Array) -> Array:
         return jnp.mean(values[source, slot].astype(jnp.float32), where=valid)

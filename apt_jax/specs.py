@@ -42,7 +42,7 @@ class Grid:
     """A `height` x `width` board of `categories`.
 
     As an observation: uint8 category indices [height, width].  As a task parameter: float32 scores
-    [height, width, categories] of which the task space takes the argmax.
+    [height, width, categories] of which the task space takes the argmax.  Category 0 is that of a cell with nothing in it.
     """
 
     height: int

@@ -53,8 +53,8 @@ class TaskSpace(Protocol):
         """One step with an action in [0, num_actions)."""
         ...
 
-    def describe(self, task: Any) -> dict[str, Float[Array, ""]]:
-        """Scalars worth watching as a curriculum unfolds; the space chooses names (e.g. `feasible`, `solution_length`).
+    def describe(self, task: Any, target: Any) -> dict[str, Float[Array, ""]]:
+        """Scalars worth watching as a curriculum unfolds, of a task alone or beside the target; the space chooses their names.
 
         NaN says "not defined for this task"; means over tasks skip it.
         """

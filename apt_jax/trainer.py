@@ -138,6 +138,8 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             batches=config.updates_per_step * steps,
             batch_size=config.batch_size,
             n_step=config.n_step,
+            episode_share=config.episode_share,
+            horizon=space.horizon,
             gamma=hparams.gamma,
         )
         low, high = replay.return_range(state.replay)
@@ -181,14 +183,14 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
 
         Draws from `key_eval` alone, so that evaluating more or less often changes nothing in training.
         """
-        key_target, key_propose, key_probe = jax.random.split(jax.random.fold_in(state.key_eval, clock.env_steps), 3)
+        key_target, key_propose, key_probe, key_steps = jax.random.split(jax.random.fold_in(state.key_eval, clock.env_steps), 4)
 
         def act(obs: Obs, key: Key[Array, ""]) -> Int[Array, "n"]:
             del key
             return learner.greedy(network, state.learner.params, obs)
 
         targets = jax.tree.map(lambda x: jnp.broadcast_to(x, (config.eval_episodes, *jnp.shape(x))), state.target)
-        outcome = evaluation.play(space, targets, act, key_target)
+        outcome, _ = evaluation.play(space, targets, act, key_target)
         score = jnp.mean(outcome.episode_return)
         kept_learner, kept, restored = learner.keep_or_restore(state.learner, state.kept, score)
         metrics = {
@@ -206,14 +208,15 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             def explore(obs: Obs, key: Key[Array, ""]) -> Int[Array, "n"]:
                 return learner.epsilon_greedy(network, state.learner.params, obs, key, epsilon)
 
-            probe = evaluation.play(space, tasks, explore, key_probe)
-            descriptions = jax.vmap(space.describe)(tasks)
+            probe, transitions = evaluation.play(space, tasks, explore, key_probe)
+            rollouts = evaluation.sample_rollouts(w, probe, transitions, key_steps, steps=space.horizon)
+            descriptions = jax.vmap(lambda task: space.describe(task, state.target))(tasks)
             metrics |= {
                 "probe_return": jnp.mean(probe.episode_return),
                 "probe_success": jnp.mean(probe.success.astype(jnp.float32)),
                 **diversity(space.param_spec, w),
                 **{f"probe_{name}": jnp.nanmean(values) for name, values in descriptions.items()},
-                **curriculum.report(state.curriculum, w, probe.episode_return),
+                **curriculum.report(state.curriculum, rollouts, hparams),
             }
         return state._replace(learner=kept_learner, kept=kept), metrics
 
@@ -292,6 +295,7 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
         config.batch_size >= sources and config.batch_size % sources == 0,
         f"batch_size must be a positive multiple of the {sources} sources, got {config.batch_size}",
     )
+    require(0.0 <= config.episode_share <= 1.0, f"episode_share must lie in [0, 1], got {config.episode_share:g}")
     require(
         config.warmup_steps >= horizon * steps,
         f"warmup_steps must let every environment finish an episode: at least {horizon * steps}, got {config.warmup_steps}",

@@ -20,7 +20,7 @@ def score(trainer: Trainer, policies: Any, task: Any, *, episodes: int, key: Key
     tasks = jax.tree.map(lambda x: jnp.broadcast_to(x, (episodes, *jnp.shape(x))), task)
 
     def play(params: Any) -> evaluation.Outcome:
-        return evaluation.play(trainer.space, tasks, lambda obs, _: trainer.act(params, obs), key)
+        return evaluation.play(trainer.space, tasks, lambda obs, _: trainer.act(params, obs), key)[0]
 
     return jax.device_get(jax.jit(jax.vmap(play))(policies))
 

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 import envs.rendering
+from apt_jax.specs import Params
 from experiments import episodes, plots, run_dir
 from experiments.problem import Problem
 from experiments.settings import Experiment, target_name
@@ -16,12 +17,16 @@ from experiments.settings import Experiment, target_name
 _COLUMNS, _ROWS = 6, 5
 """Steps and seeds in the picture of the progression, at most."""
 
+_SMALL = 8
+"""Pixels per tile where many boards are shown together."""
+
 
 def draw(path: Path, experiment: Experiment, problem: Problem, policies: Any) -> None:
     """Learning curves, progression of generated tasks, and the best seed's policy (leaves [L, ...]) on the target."""
     draw_curves(path, experiment)
     if run_dir.task_files(path):
         draw_progression(path, experiment, problem)
+        draw_tasks(path, experiment, problem)
     draw_policy(path, experiment, problem, policies)
 
 
@@ -53,6 +58,25 @@ def draw_progression(path: Path, experiment: Experiment, problem: Problem) -> No
         problem.space.render(problem.target),
         rows=[f"seed {experiment.seeds[lane]}" for lane in lanes],
     )
+
+
+def draw_tasks(path: Path, experiment: Experiment, problem: Problem) -> None:
+    """tasks/seed_*.png: all sampled tasks of each seed over time."""
+    instantiate = jax.jit(problem.space.instantiate)
+    samples = {}
+    for step, file in run_dir.task_files(path).items():
+        with np.load(file) as w:
+            samples[step] = {name: w[name] for name in w}
+
+    def picture(w: Params) -> plots.Image:
+        return problem.space.render(instantiate(w), tile_size=_SMALL)
+
+    for lane, seed in enumerate(experiment.seeds):
+        boards = {
+            step: [picture({name: w[name][lane, i] for name in w}) for i in range(next(iter(w.values())).shape[1])]
+            for step, w in samples.items()
+        }
+        plots.mosaic(path / "tasks" / f"seed_{seed}.png", boards, title=f"generated tasks, seed {seed}")
 
 
 def draw_policy(path: Path, experiment: Experiment, problem: Problem, policies: Any) -> None:

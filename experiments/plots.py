@@ -104,6 +104,24 @@ def progression(file: Path, boards: Mapping[int, Sequence[Image]], target: Image
     figure.savefig(file, dpi=150)
 
 
+def mosaic(file: Path, boards: Mapping[int, Sequence[Image]], *, title: str) -> None:
+    """Samples of generated tasks over time, as one image: by environment step (columns), several pictures (rows)."""
+    gap = 4
+    padded = [
+        [np.pad(board, ((0, gap), (0, gap), (0, 0)), constant_values=255) for board in column] for column in boards.values()
+    ]
+    image = np.concatenate([np.concatenate(column, axis=0) for column in padded], axis=1)
+    width = padded[0][0].shape[1]
+    margin = 0.6
+    figure = Figure(figsize=(image.shape[1] / 100 + margin, image.shape[0] / 100 + margin), layout="constrained")
+    axes = figure.subplots()
+    _show(axes, image)
+    axes.set_xticks(np.arange(len(boards)) * width + width / 2, [f"{step / 1000:g}k" for step in boards])
+    axes.tick_params(length=0, labelsize="small")
+    axes.set_title(title, fontsize="medium")
+    figure.savefig(file, dpi=100)
+
+
 def gallery(file: Path, pictures: Sequence[Image], *, columns: int) -> None:
     """Pictures in rows of `columns`."""
     rows = -(-len(pictures) // columns)

@@ -140,11 +140,12 @@ def task_files(path: Path) -> dict[int, Path]:
 
 
 def _read_rows(path: Path) -> list[dict[str, str]]:
+    """Rows of metrics.csv; a last one that a killed process has left unfinished is not counted."""
     file = path / "metrics.csv"
     if not file.exists():
         return []
     with file.open(newline="") as stream:
-        return list(csv.DictReader(stream))
+        return [row for row in csv.DictReader(stream) if None not in row.values()]
 
 
 def _write_rows(file: Path, rows: Sequence[Mapping[str, object]], mode: str) -> None:

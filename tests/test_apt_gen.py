@@ -12,6 +12,7 @@ import pytest
 
 from apt_jax.config import HParams
 from apt_jax.curricula import apt_gen
+from apt_jax.curricula import apt_gen_objectives as objectives
 from apt_jax.specs import Grid
 from tests.corridor import Corridor
 from tests.test_trainer import CONFIG, run
@@ -41,7 +42,7 @@ def experience():
 @pytest.mark.parametrize(("beta", "optimum"), [(0.125, 2.667), (3.0, 6.5), (8.0, 7.333)])
 def test_generator_reaches_the_optimum_of_v1_plus_beta_v2(monkeypatch, experience, beta, optimum):
     """V1 peaks at 2 and V2 at 8, so the sum peaks at (2 + 8 beta) / (1 + beta)."""
-    monkeypatch.setattr(apt_gen, "ValueNetwork", Bowl)
+    monkeypatch.setattr(objectives, "ValueNetwork", Bowl)
     replay, iteration = experience
     hparams = HParams(value_learning_rate=0.0, generator_learning_rate=1e-2, vector_noise=0.0)
     curriculum = apt_gen.make(SPACE, CONFIG)
@@ -84,18 +85,33 @@ def test_discriminator_and_values_learn_from_the_same_experience(experience):
 def test_values_see_the_task_that_is_played():
     spec = {"paint": Grid(1, 1, 3)}
     scores = jnp.array([[[0.2, 0.5, 0.3]]])
-    seen = apt_gen.as_instantiated(spec, {"paint": scores})["paint"]
+    seen = objectives.as_instantiated(spec, {"paint": scores})["paint"]
     np.testing.assert_allclose(seen, [[[0.0, 1.0, 0.0]]], atol=1e-6)
     weights = jnp.array([1.0, 2.0, 3.0])
-    gradient = jax.grad(lambda s: jnp.sum(apt_gen.as_instantiated(spec, {"paint": s})["paint"] * weights[None, None]))(scores)
+    gradient = jax.grad(lambda s: jnp.sum(objectives.as_instantiated(spec, {"paint": s})["paint"] * weights[None, None]))(
+        scores
+    )
     np.testing.assert_allclose(gradient[0, 0], weights)
 
 
 def test_pessimism_takes_deviations_off_the_mean_and_has_a_gradient_where_all_agree():
-    np.testing.assert_allclose(apt_gen.pessimistic(jnp.array([[1.0], [3.0]]), 0.5), [1.5], rtol=1e-3)
-    np.testing.assert_allclose(apt_gen.pessimistic(jnp.array([[2.0]]), 0.5), [2.0])
-    gradient = jax.grad(lambda values: apt_gen.pessimistic(values, 1.0).sum())(jnp.ones((4, 3)))
+    np.testing.assert_allclose(objectives.pessimistic(jnp.array([[1.0], [3.0]]), 0.5), [1.5], rtol=1e-3)
+    np.testing.assert_allclose(objectives.pessimistic(jnp.array([[2.0]]), 0.5), [2.0])
+    gradient = jax.grad(lambda values: objectives.pessimistic(values, 1.0).sum())(jnp.ones((4, 3)))
     assert np.isfinite(gradient).all()
+
+
+def test_progress_is_the_discriminators_probability():
+    np.testing.assert_allclose(objectives.task_progress(jnp.array([0.0, 6.0]), 2.0, relative=False), [0.5, 0.952574], rtol=1e-5)
+
+
+def test_relative_progress_keeps_its_order_and_spread_whatever_the_logits():
+    logit = jax.random.normal(jax.random.key(0), (500,))
+    plain = objectives.task_progress(logit, 1.0, relative=True)
+    np.testing.assert_allclose(objectives.task_progress(30.0 * logit - 100.0, 1.0, relative=True), plain, atol=1e-3)
+    np.testing.assert_array_equal(jnp.argsort(plain), jnp.argsort(logit))
+    np.testing.assert_allclose((jnp.mean(plain), jnp.std(plain)), (0.5, 0.21), atol=0.01)
+    np.testing.assert_array_equal(objectives.task_progress(jnp.ones(3), 1.0, relative=True), jnp.full(3, 0.5))
 
 
 def test_correlation():

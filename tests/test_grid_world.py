@@ -261,7 +261,7 @@ class TestTargets:
         assert len(plan) == steps
         assert outs[-1].success
         assert sum(float(out.reward) for out in outs) == pytest.approx(best, abs=1e-6)
-        described = SPACE.describe(task)
+        described = SPACE.describe(task, task)
         assert described["feasible"] == 1
         assert described["solution_length"] == steps
 
@@ -280,8 +280,16 @@ class TestTargets:
         jax.tree.map(np.testing.assert_array_equal, task, target)
 
     def test_shares(self):
-        described = SPACE.describe(load_all()["A"])
+        described = SPACE.describe(load_all()["A"], load_all()["B"])
         assert (described["walls"], described["lava"]) == (6 / 64, 3 / 64)
+
+    def test_distance_from_the_target(self):
+        here = PLACE(params(objects={GOAL: (3, 4)}, tiles={(8, 8): WALL, (7, 7): LAVA}))
+        there = PLACE(params(objects={GOAL: (1, 8)}, tiles={(8, 8): LAVA}))
+        described = SPACE.describe(here, there)
+        assert (described["tile_distance"], described["goal_distance"]) == (2 / 64, 6)
+        assert SPACE.describe(here, here)["tile_distance"] == SPACE.describe(here, here)["goal_distance"] == 0
+        assert jnp.isnan(SPACE.describe(PLACE(params()), there)["goal_distance"])
 
 
 def load_all():
@@ -309,7 +317,7 @@ class TestSolver:
 
     def test_a_start_on_the_goal_has_no_solution(self):
         task = PLACE(params(objects={GOAL: (1, 1)}))
-        described = SPACE.describe(task)
+        described = SPACE.describe(task, task)
         assert solve(task) is None
         assert described["feasible"] == 0
         assert jnp.isnan(described["solution_length"])
@@ -317,7 +325,7 @@ class TestSolver:
     def test_a_task_without_goal_has_no_solution(self):
         task = PLACE(params())
         assert solve(task) is None
-        assert SPACE.describe(task)["feasible"] == 0
+        assert SPACE.describe(task, task)["feasible"] == 0
 
     @pytest.mark.parametrize(("last_row", "length"), [("......y.", 50), (".....y..", None)])
     def test_the_horizon_bounds_solutions(self, last_row, length):
@@ -331,7 +339,7 @@ class TestSolver:
             assert_step(play(task, plan)[-1], position=(3, 1), reward=0.999, terminated=True, success=True)
 
     def test_both_searches_agree_on_random_tasks(self, varied_tasks):
-        described = jax.device_get(jax.jit(jax.vmap(SPACE.describe))(varied_tasks))
+        described = jax.device_get(jax.jit(jax.vmap(SPACE.describe))(varied_tasks, varied_tasks))
         plans = [solve(task) for task in unstack(varied_tasks)]
         lengths = np.array([np.nan if plan is None else len(plan) for plan in plans], np.float32)
         np.testing.assert_array_equal(described["solution_length"], lengths)

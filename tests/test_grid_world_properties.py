@@ -126,7 +126,7 @@ def test_layouts_read_back(w):
 
 @given(params)
 def test_descriptions_are_in_range(w):
-    described = jax.device_get(describe(instantiate(w)))
+    described = jax.device_get(describe(instantiate(w), instantiate(w)))
     assert described["feasible"] == np.isfinite(described["solution_length"])
     assert not described["solution_length"] < 1
     assert not described["solution_length"] > HORIZON

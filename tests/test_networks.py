@@ -197,9 +197,28 @@ def test_generator_sizes():
     _, variables = noise_and_variables()
     norm = 2  # scale and bias
     vectors = sum((64 + norm) * size for size in (2, 1))
-    # The projection is normalised per unit, convolutions per channel.
-    grids = sum((64 + norm) * 16 * cells + 2 * (9 * 16 + norm) * 16 + (9 * 16 + norm) * 3 for cells in (4, 2))
+    # The projection is normalised per unit, convolutions per channel, scores per cell and category.
+    grids = sum(
+        (64 + norm) * 16 * cells + 2 * (9 * 16 + norm) * 16 + 9 * 16 * 3 + norm * 3 * scores
+        for cells, scores in ((4, 64), (2, 24))
+    )
     assert count(variables["params"]) == (NOISE_SIZE + norm) * 64 + vectors + grids
+
+
+def test_blank_bias_gives_category_0_a_head_start():
+    z, _ = noise_and_variables()
+    generator = Generator(PARAM_SPEC, blank_bias=2.0)
+    w, _ = generator.apply(generator.init(jax.random.key(1), z, train=True), z, train=True, mutable=["batch_stats"])
+    for name in ("tiles", "table"):
+        blank = jnp.mean(jnp.argmax(w[name], axis=-1) == 0)
+        assert 0.7 < blank < 0.95
+
+
+def test_every_cells_scores_differ_with_noise():
+    z, variables = noise_and_variables()
+    w, _ = generate_train(variables, z)
+    for name in ("tiles", "table"):
+        assert (jnp.argmax(w[name], axis=-1).std(axis=0) > 0.1).all()
 
 
 def test_generator_outputs_differ_with_noise():

@@ -40,3 +40,13 @@ def test_progression_and_gallery(tmp_path):
 @pytest.mark.parametrize(("count", "at_most", "chosen"), [(1, 6, [0]), (3, 6, [0, 10, 20]), (11, 3, [0, 50, 100])])
 def test_evenly_keeps_first_and_last(count, at_most, chosen):
     assert plots.evenly([10 * i for i in range(count)], at_most) == chosen
+
+
+def test_mosaic_has_a_column_per_step_and_a_row_per_task(tmp_path):
+    board = np.full((40, 40, 3), 90, np.uint8)
+    sizes = []
+    for steps in (2, 6):
+        plots.mosaic(tmp_path / "m.png", {1000 * step: [board] * 3 for step in range(steps)}, title="tasks")
+        sizes.append(read(tmp_path / "m.png").shape)
+    assert sizes[1][1] - sizes[0][1] == pytest.approx(4 * 44, abs=8)
+    assert sizes[0][0] == sizes[1][0] > 3 * 40

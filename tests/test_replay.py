@@ -105,6 +105,32 @@ def test_sampled_transitions_are_whole_recent_and_equally_shared(iterations):
     assert len(np.unique(code)) == written, "3,200 draws from at most 96 rows miss none"
 
 
+def test_a_share_of_transitions_is_drawn_by_episode():
+    """Every finished episode that is still whole is as likely as any other, whatever its length, and every step of it."""
+    rings, finished = _written(41, seed=3)
+    longest = max(episode[2] for source in finished for episode in source[-SLOTS:])
+    batch = replay.sample_transitions(
+        rings,
+        jax.random.key(1),
+        jnp.int32(40),
+        batches=400,
+        batch_size=64,
+        n_step=1,
+        gamma=0.5,
+        episode_share=0.75,
+        horizon=longest,
+    )
+    code = np.asarray(batch.reward).reshape(400, SOURCES, 32).astype(int)[..., -24:]
+    for source in range(SOURCES):
+        whole = [episode for episode in finished[source][-SLOTS:] if episode[1] > 40 - COLUMNS + longest]
+        assert len(whole) > 2
+        drawn = code[:, source].ravel()
+        for env, end, length, _ in whole:
+            counts = [np.mean(drawn == _code(source, env, iteration)) for iteration in range(end - length + 1, end + 1)]
+            np.testing.assert_allclose(counts, 1 / len(whole) / length, atol=0.02)
+            np.testing.assert_allclose(np.sum(counts), 1 / len(whole), atol=0.02)
+
+
 @pytest.mark.parametrize("n_step", [1, 2, 4])
 def test_n_step_transitions_stop_at_the_end_of_the_episode_and_of_what_is_written(n_step):
     iterations, gamma = 41, 0.5
@@ -165,3 +191,13 @@ def test_recent_outcome_is_the_mean_of_the_last_episodes_only():
     np.testing.assert_allclose(outcome["success"], np.mean(np.array(last) > 0))
     empty = replay.init(OBS, PARAM, sources=SOURCES, envs=ENVS, columns=COLUMNS, episodes=SLOTS)
     assert np.isnan(replay.recent_outcome(empty, source=0, window=4)["episode_return"])
+
+
+def test_recent_outcome_leaves_out_what_ended_too_early():
+    rings, finished = _written(41)
+    since = finished[1][-3][1]
+    recent = [episode[3] for episode in finished[1] if episode[1] >= since]
+    outcome = replay.recent_outcome(rings, source=1, window=SLOTS, since=since)
+    assert 3 <= len(recent) < SLOTS
+    np.testing.assert_allclose(outcome["episode_return"], np.mean(recent), rtol=1e-6)
+    assert np.isnan(replay.recent_outcome(rings, source=1, window=SLOTS, since=41)["episode_return"])

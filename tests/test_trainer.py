@@ -184,16 +184,17 @@ def test_every_method_learns_a_shorter_corridor(method):
     np.testing.assert_allclose(metrics["target_return_raw"], 0.96, atol=1e-5)
 
 
-def test_resuming_from_a_checkpoint_equals_never_having_stopped(tmp_path):
-    """Bit for bit, in every leaf of the state."""
+@pytest.mark.parametrize("stop", [0, 1, 2])
+def test_resuming_from_a_checkpoint_equals_never_having_stopped(tmp_path, stop):
+    """Bit for bit, in every leaf of the state, whichever chunk was the last before the stop."""
     cfg = config("apt_gen")
     straight, straight_clock, _ = run(cfg, [0, 1], chunks=3)
-    states, clock, _ = run(cfg, [0, 1], chunks=1)
+    states, clock, _ = run(cfg, [0, 1], chunks=stop)
     checkpoint.save(tmp_path, int(clock.env_steps), (states, clock))
     template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), (states, clock))
     lanes = stack_hparams([HParams()] * 2)
     states, clock = checkpoint.restore(tmp_path, template)
-    for _ in range(2):
+    for _ in range(3 - stop):
         states, clock, _ = program(cfg, 2, "map").chunk(states, clock, lanes)
     for a, b in zip(leaves((states, clock)), leaves((straight, straight_clock)), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -11,9 +11,10 @@ from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import replay as rp
 from apt_jax.config import Config, HParams
+from apt_jax.curricula.apt_gen_objectives import make_objectives, task_progress
 from apt_jax.curricula.base import GENERATED, TARGET, Curriculum, Metrics
-from apt_jax.losses import adapt_beta, discriminator_loss, generator_objective
-from apt_jax.networks import Discriminator, Generator, ValueNetwork, init_singular_vectors, pool, spectral_normalize
+from apt_jax.losses import adapt_beta
+from apt_jax.networks import init_singular_vectors, spectral_normalize
 from apt_jax.networks.apply import apply
 from apt_jax.specs import Grid, Params, Spec, obs_struct, param_struct, zeros_like
 from apt_jax.task_space import TaskSpace
@@ -41,70 +42,35 @@ class AptGenState(NamedTuple):
 _ADAM = optax.flatten(optax.scale_by_adam())
 
 
-def as_instantiated(spec: Spec, w: Params) -> Params:
-    """Replace category scores by the one-hot of their argmax, with the gradient of the scores (straight-through).
-
-    A task shows nothing of its scores but their argmax, so this is what the value networks are to see.
-    """
-
-    def harden(name: str) -> Array:
-        scores = w[name]
-        if not isinstance(spec[name], Grid):
-            return scores
-        one_hot = jax.nn.one_hot(jnp.argmax(scores, axis=-1), scores.shape[-1])
-        return scores + jax.lax.stop_gradient(one_hot - scores)
-
-    return {name: harden(name) for name in w}
-
-
 def make(space: TaskSpace, config: Config) -> Curriculum:
     """The paper's curriculum."""
-    generator = Generator(space.param_spec)
-    discriminator = Discriminator(space.obs_spec, space.num_actions)
-    value = ValueNetwork(space.param_spec)
-    recent = config.recent_steps // config.envs_per_source
+    objectives = make_objectives(space, config)
+    networks = objectives.networks
     batch = config.model_batch_size
+    recent = config.recent_steps // config.envs_per_source
+    warm = config.warmup_steps // (2 * config.envs_per_source)
 
     def noise(key: Key[Array, ""], n: int) -> Float[Array, "n z"]:
         return jax.random.normal(key, (n, config.noise_size))
 
-    def generate(params: Any, batch_stats: Any, z: Float[Array, "n z"]) -> tuple[Params, Any]:
-        """Tasks under the batch's own statistics, and the running statistics moved towards them."""
-        variables = {"params": params, "batch_stats": batch_stats}
-        w, updated = apply(generator, variables, z, train=True, mutable=["batch_stats"])
-        return w, updated["batch_stats"]
-
-    def score(params: Any, rollouts: rp.Rollouts) -> Float[Array, "B"]:
-        """The discriminator's pooled logit of each rollout."""
-        steps = rollouts.steps
-        initial = apply(discriminator, params, rollouts.initial_obs, method="score_init")
-        transitions = apply(
-            discriminator, params, steps.obs, steps.action, reward=steps.reward, next_obs=steps.next_obs, method="score_step"
-        )
-        return pool(initial, transitions, rollouts.length)
-
-    def evaluate(params: Any, w: Params) -> Float[Array, "K n"]:
-        """What each network of an ensemble says of tasks (leaves [n, ...])."""
-        return jax.vmap(lambda member: apply(value, member, as_instantiated(space.param_spec, w)))(params)
-
     def init_ensemble(key: Key[Array, ""]) -> Any:
         w = zeros_like(param_struct(space.param_spec))
-        return jax.vmap(lambda key: value.init(key, w))(jax.random.split(key, config.value_ensemble))
+        return jax.vmap(lambda key: networks.value.init(key, w))(jax.random.split(key, config.value_ensemble))
 
     def init(key: Key[Array, ""], hparams: HParams) -> AptGenState:
         key_g, key_d, key_1, key_2, key_spectral, key_stats = jax.random.split(key, 6)
-        variables = generator.init(key_g, jnp.zeros((2, config.noise_size)), train=True)
+        variables = networks.generator.init(key_g, jnp.zeros((2, config.noise_size)), train=True)
         obs = zeros_like(obs_struct(space.obs_spec))
         models = Models(
             generator=variables["params"],
-            discriminator=discriminator.init(key_d, obs, jnp.int32(0), reward=jnp.float32(0.0), next_obs=obs),
+            discriminator=networks.discriminator.init(key_d, obs, jnp.int32(0), reward=jnp.float32(0.0), next_obs=obs),
             progress_value=init_ensemble(key_1),
             return_value=init_ensemble(key_2),
         )
 
         # The first tasks are drawn from running statistics, which must describe the fresh generator before it is used.
         def settle(stats: Any, z: Float[Array, "n z"]) -> tuple[Any, None]:
-            return generate(models.generator, stats, z)[1], None
+            return objectives.generate(models.generator, stats, z)[1], None
 
         z = noise(key_stats, 100 * batch).reshape(100, batch, config.noise_size)
         batch_stats, _ = jax.lax.scan(settle, variables["batch_stats"], z)
@@ -119,7 +85,7 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
     def propose(state: AptGenState, key: Key[Array, ""], n: int, hparams: HParams) -> Params:
         key_z, key_explore = jax.random.split(key)
         variables = {"params": state.models.generator, "batch_stats": state.batch_stats}
-        w = apply(generator, variables, noise(key_z, n), train=False)
+        w = apply(networks.generator, variables, noise(key_z, n), train=False)
         return explore(space.param_spec, w, key_explore, hparams)
 
     def update(
@@ -139,41 +105,35 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
             )
 
         target, generated = sample(key_target, TARGET), sample(key_generated, GENERATED)
-        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), target, generated)
         z = noise(key_z, batch)
 
         def loss(models: Models) -> tuple[Float[Array, ""], tuple[Any, Any, Metrics]]:
             """All four objectives: each parameter group receives the gradient of its own alone."""
-            params, spectral = spectral_normalize(models.discriminator, state.spectral, bound=hparams.spectral_bound)
-            target_logit, generated_logit = jnp.split(score(params, both), 2)
-            loss_d = discriminator_loss(target_logit, generated_logit)
-
-            progress = jax.lax.stop_gradient(jax.nn.sigmoid(generated_logit / hparams.progress_temperature))
-            progress_error = evaluate(models.progress_value, generated.w) - progress[None]
-            return_error = evaluate(models.return_value, generated.w) - generated.episode_return[None]
-
-            w, batch_stats = generate(models.generator, state.batch_stats, z)
-            frozen = jax.lax.stop_gradient(models)
-            progress_value = pessimistic(evaluate(frozen.progress_value, w), hparams.pessimism)
-            return_value = pessimistic(evaluate(frozen.return_value, w), hparams.pessimism)
-            objective = generator_objective(progress_value, return_value, beta=state.beta, delta=hparams.delta)
+            loss_d, ((target_logit, generated_logit), spectral) = objectives.discriminator(
+                models.discriminator, state.spectral, target, generated, hparams
+            )
+            progress = jax.lax.stop_gradient(
+                task_progress(generated_logit, hparams.progress_temperature, relative=config.relative_progress)
+            )
+            loss_1, progress_error = objectives.value(models.progress_value, generated.w, progress)
+            loss_2, return_error = objectives.value(models.return_value, generated.w, generated.episode_return)
+            ensembles = jax.lax.stop_gradient((models.progress_value, models.return_value))
+            loss_g, (batch_stats, (progress_value, return_value)) = objectives.generator(
+                models.generator, state.batch_stats, z, ensembles, state.beta, hparams
+            )
             metrics = {
                 "discriminator_loss": loss_d,
                 "discriminator_target_logit": jnp.mean(target_logit),
                 "discriminator_generated_logit": jnp.mean(generated_logit),
                 "discriminator_generated_spread": jnp.std(generated_logit),
-                "discriminator_accuracy": 0.5
-                * (jnp.mean(jnp.float32(target_logit > 0.0)) + jnp.mean(jnp.float32(generated_logit < 0.0))),
+                "discriminator_target_accuracy": jnp.mean(jnp.float32(target_logit > 0.0)),
+                "discriminator_generated_accuracy": jnp.mean(jnp.float32(generated_logit < 0.0)),
                 "v1_unexplained": jnp.mean(progress_error**2) / (jnp.var(progress) + 1e-6),
                 "v2_unexplained": jnp.mean(return_error**2) / (jnp.var(generated.episode_return) + 1e-6),
-                "generator_progress": jnp.mean(progress_value),
-                "generator_return": jnp.mean(return_value),
+                "generator_progress": progress_value,
+                "generator_return": return_value,
             }
-            # Sums over the ensemble: each network has a loss of its own.
-            loss_1 = jnp.sum(jnp.mean(progress_error**2, axis=1))
-            loss_2 = jnp.sum(jnp.mean(return_error**2, axis=1))
-            total = loss_d + loss_1 + loss_2 - objective
-            return total, (batch_stats, spectral, metrics)
+            return loss_d + loss_1 + loss_2 + loss_g, (batch_stats, spectral, metrics)
 
         grads, (batch_stats, spectral, metrics) = jax.grad(loss, has_aux=True)(state.models)
         direction, opt_state = _ADAM.update(grads, state.opt_state)
@@ -192,7 +152,7 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
         return AptGenState(models, opt_state, batch_stats, spectral, state.beta), metrics
 
     def refresh(state: AptGenState, replay: rp.Replay, hparams: HParams) -> AptGenState:
-        outcome = rp.recent_outcome(replay, source=GENERATED, window=config.return_window)
+        outcome = rp.recent_outcome(replay, source=GENERATED, window=config.return_window, since=warm)
         beta = adapt_beta(
             state.beta,
             outcome["episode_return"],
@@ -203,12 +163,18 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
         )
         return state._replace(beta=beta)
 
-    def report(state: AptGenState, w: Params, episode_return: Float[Array, "n"]) -> Metrics:
-        predicted = jnp.mean(evaluate(state.models.return_value, w), axis=0)
+    def report(state: AptGenState, rollouts: rp.Rollouts, hparams: HParams) -> Metrics:
+        discriminator, _ = spectral_normalize(state.models.discriminator, state.spectral, bound=hparams.spectral_bound)
+        logit = objectives.score(discriminator, rollouts)
+        progress = task_progress(logit, hparams.progress_temperature, relative=config.relative_progress)
+        expected_progress = jnp.mean(objectives.evaluate(state.models.progress_value, rollouts.w), axis=0)
+        expected_return = jnp.mean(objectives.evaluate(state.models.return_value, rollouts.w), axis=0)
         return {
             "beta": state.beta,
-            "v2_correlation": correlation(predicted, episode_return),
-            "v2_bias": jnp.mean(predicted - episode_return),
+            "probe_logit": jnp.mean(logit),
+            "v1_correlation": correlation(expected_progress, progress),
+            "v2_correlation": correlation(expected_return, rollouts.episode_return),
+            "v2_bias": jnp.mean(expected_return - rollouts.episode_return),
         }
 
     return Curriculum(True, init, propose, update, refresh, report)
@@ -236,14 +202,6 @@ def explore(spec: Spec, w: Params, key: Key[Array, ""], hparams: HParams) -> Par
             noisy = block + spread * jax.random.normal(key_noise, block.shape)
             explored[name] = jnp.clip(noisy, modality.low, modality.high)
     return explored
-
-
-def pessimistic(values: Float[Array, "K n"], pessimism: Float[Array, ""] | float) -> Float[Array, "n"]:
-    """Mean of an ensemble less `pessimism` standard deviations: where the networks disagree there was little experience."""
-    if values.shape[0] == 1:
-        return values[0]
-    spread = jnp.sqrt(jnp.var(values, axis=0) + 1e-8)  # the root has no gradient at zero
-    return jnp.mean(values, axis=0) - pessimism * spread
 
 
 def correlation(a: Float[Array, "n"], b: Float[Array, "n"]) -> Float[Array, ""]:

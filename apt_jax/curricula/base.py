@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Protocol
 from jaxtyping import Array, Float, Int, Key
 
 from apt_jax.config import HParams
-from apt_jax.replay import Replay
+from apt_jax.replay import Replay, Rollouts
 from apt_jax.specs import Params
 
 TARGET, GENERATED = 0, 1
@@ -43,9 +43,9 @@ class RefreshFn(Protocol):
 
 
 class ReportFn(Protocol):
-    """`report(state, w, episode_return) -> metrics`: judge the state on fresh tasks (leaves [n, ...]) and their returns [n]."""
+    """`report(state, rollouts, hparams) -> metrics`: judge the state on fresh tasks that the behaviour policy has played."""
 
-    def __call__(self, state: Any, w: Params, episode_return: Float[Array, "n"]) -> Metrics: ...
+    def __call__(self, state: Any, rollouts: Rollouts, hparams: HParams) -> Metrics: ...
 
 
 class Curriculum(NamedTuple):
@@ -76,7 +76,7 @@ def no_refresh(state: Any, replay: Replay, hparams: HParams) -> Any:
     return state
 
 
-def no_report(state: Any, w: Params, episode_return: Float[Array, "n"]) -> Metrics:
+def no_report(state: Any, rollouts: Rollouts, hparams: HParams) -> Metrics:
     """The `report` of a curriculum that has no model of tasks."""
-    del state, w, episode_return
+    del state, rollouts, hparams
     return {}

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 from math import prod
+from typing import Any
 
 import flax.linen as nn
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
 
 from apt_jax.networks.encoders import CHANNELS, ENCODING_SIZE
 from apt_jax.networks.layers import Conv, ConvTranspose
@@ -22,11 +24,13 @@ class Generator(nn.Module):
 
     Attributes:
       param_spec: the task parameter's modalities.
+      blank_bias: initial bias of a grid's category 0, whose scores have unit spread: 2 leaves about five cells in six blank.
       momentum: of the running statistics.  0.9 averages about 20 batches and lags 10 updates behind the weights; the lag of
         0.99, 100 updates, costs more than its steadier average gains.
     """
 
     param_spec: Spec
+    blank_bias: float = 0.0
     momentum: float = 0.9
 
     @nn.compact
@@ -40,7 +44,7 @@ class Generator(nn.Module):
                 case Vector():
                     w[name] = VectorHead(modality, norm, name=name)(hidden)
                 case Grid():
-                    w[name] = GridHead(modality, norm, name=name)(hidden)
+                    w[name] = GridHead(modality, self.blank_bias, norm, name=name)(hidden)
         return w
 
 
@@ -59,10 +63,12 @@ class VectorHead(nn.Module):
 class GridHead(nn.Module):
     """Two transposed convolutions from a quarter of the board, a convolution, a softmax: [batch, hidden] -> [batch, h, w, c].
 
-    Boards whose sides are no multiple of four are cut out of the next larger one.
+    Boards whose sides are no multiple of four are cut out of the next larger one.  The scores are normalised cell by cell, over
+    the batch alone: over cells too, one board could have all the variance within it and be the same for every z.
     """
 
     grid: Grid
+    blank_bias: float
     norm: partial[nn.BatchNorm]
 
     @nn.compact
@@ -72,5 +78,9 @@ class GridHead(nn.Module):
         for _ in range(2):
             x = nn.relu(self.norm()(ConvTranspose(CHANNELS)(x)))
         x = x[:, : self.grid.height, : self.grid.width]
-        x = self.norm()(Conv(self.grid.categories, use_bias=False)(x))
+        x = self.norm(axis=(-3, -2, -1), bias_init=self._blank)(Conv(self.grid.categories, use_bias=False)(x))
         return nn.softmax(x)
+
+    def _blank(self, key: Key[Array, ""], shape: tuple[int, ...], dtype: Any = jnp.float32) -> Float[Array, "h w c"]:
+        del key
+        return jnp.zeros(shape, dtype).at[..., 0].set(self.blank_bias)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, Key, UInt8
 from apt_jax.specs import Obs, Params, Spec, param_struct
 from apt_jax.task_space import StepOutput
 from envs.grid_world import dynamics
-from envs.grid_world.board import BOARD, LAVA, WALL, Task
+from envs.grid_world.board import BOARD, GOAL, LAVA, WALL, Task
 from envs.grid_world.dynamics import HORIZON, MOVES, State
 from envs.grid_world.layout import parse_layout
 from envs.grid_world.observation import OBS_SPEC, observe
@@ -59,19 +59,23 @@ class Space:
         """One move (0 up, 1 right, 2 down, 3 left); see `dynamics` for the rules."""
         return dynamics.step(state, action, task)
 
-    def describe(self, task: Task) -> dict[str, Float[Array, ""]]:
-        """How a task can be solved and what it is built of.
+    def describe(self, task: Task, target: Task) -> dict[str, Float[Array, ""]]:
+        """How a task can be solved, what it is built of, and how far it is from the target.
 
         `feasible`: 1 if it can be solved within the horizon, else 0.  `solution_length`: steps of the shortest solution, NaN if
-        infeasible.  `walls`, `lava`: shares of the 64 interior tiles, in [0, 1].
+        infeasible.  `walls`, `lava`: shares of the 64 interior tiles, in [0, 1].  `tile_distance`: share of the interior tiles
+        whose category is not the target's.  `goal_distance`: rows plus columns between both goals, NaN if either is absent.
         """
         length = solution_length(task)
-        interior = task.tiles[1:-1, 1:-1]
+        interior, wanted = (board.tiles[1:-1, 1:-1] for board in (task, target))
+        apart = jnp.sum(jnp.abs(task.objects[GOAL] - target.objects[GOAL]))
         return {
             "feasible": (~jnp.isnan(length)).astype(jnp.float32),
             "solution_length": length,
             "walls": jnp.mean(interior == WALL),
             "lava": jnp.mean(interior == LAVA),
+            "tile_distance": jnp.mean(interior != wanted),
+            "goal_distance": jnp.where(task.present[GOAL] & target.present[GOAL], apart.astype(jnp.float32), jnp.nan),
         }
 
     def parse_target(self, text: str) -> Task:

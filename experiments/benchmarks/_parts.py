@@ -12,12 +12,10 @@ from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import learner, replay, workers
 from apt_jax.curricula import make_curriculum
-from apt_jax.curricula.apt_gen import as_instantiated, pessimistic
+from apt_jax.curricula.apt_gen_objectives import make_objectives
 from apt_jax.curricula.base import GENERATED, TARGET
-from apt_jax.losses import discriminator_loss, generator_objective
-from apt_jax.networks import Discriminator, Generator, QNetwork, ValueNetwork, init_singular_vectors, pool, spectral_normalize
-from apt_jax.networks.apply import apply
-from apt_jax.specs import obs_struct, param_struct, zeros_like
+from apt_jax.networks import QNetwork
+from apt_jax.specs import zeros_like
 from apt_jax.trainer import Clock, TrainState
 from experiments.benchmarks._measure import Problem, Timing, time_loop
 
@@ -67,17 +65,15 @@ def iteration_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[s
     updates = config.updates_per_step * SOURCES * envs
     rounds = round(config.model_updates_per_step * SOURCES * envs)
 
-    def act(_: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
-        del iteration
-        params, obs = fixed
-        return (), learner.epsilon_greedy(network, params, obs, key, hparams.epsilon_end)
-
     def propose(_: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         del iteration
         return (), workers.assign(space, target, curriculum.propose(fixed, key, envs, hparams), envs)
 
-    def step(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
-        state, *recorded = workers.step(space, state, fixed[0], fixed[1], iteration, key)
+    def act_and_step(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
+        params, assignment = fixed
+        key_act, key_step = jax.random.split(key)
+        action = learner.epsilon_greedy(network, params, state.obs, key_act, hparams.epsilon_end)
+        state, *recorded = workers.step(space, state, action, assignment, iteration, key_step)
         return state, recorded
 
     def write(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
@@ -93,6 +89,8 @@ def iteration_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[s
             batches=updates,
             batch_size=config.batch_size,
             n_step=config.n_step,
+            episode_share=config.episode_share,
+            horizon=space.horizon,
             gamma=hparams.gamma,
         )
         return (), batches
@@ -113,17 +111,15 @@ def iteration_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[s
         del key, iteration
         return curriculum.refresh(state, fixed, hparams), ()
 
-    key_act, key_propose, key_step, key_sample = jax.random.split(jax.random.key(1), 4)
-    params, obs = state.learner.params, state.workers.obs
-    _, action = jax.jit(act)((), (params, obs), key_act, clock.iteration)
+    key_propose, key_step, key_sample = jax.random.split(jax.random.key(1), 3)
+    params = state.learner.params
     _, assignment = jax.jit(propose)((), state.curriculum, key_propose, clock.iteration)
-    _, recorded = jax.jit(step)(state.workers, (action, assignment), key_step, clock.iteration)
+    _, recorded = jax.jit(act_and_step)(state.workers, (params, assignment), key_step, clock.iteration)
     # The latest iteration written is the one before the clock's.
     _, batches = jax.jit(sample)((), state.replay, key_sample, clock.iteration - 1)
     return {
-        "act": Part(act, (), (params, obs)),
         "propose tasks": Part(propose, (), state.curriculum),
-        "step environments": Part(step, state.workers, (action, assignment)),
+        "act and step": Part(act_and_step, state.workers, (params, assignment)),
         "write": Part(write, state.replay, recorded),
         "sample": Part(sample, (), state.replay),
         "update policy": Part(update_policy, state.learner, (batches, replay.return_range(state.replay))),
@@ -133,10 +129,10 @@ def iteration_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[s
 
 
 def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, Part]:
-    """One model update of APT-Gen split up: each network's forward and backward pass and Adam without the others."""
+    """One model update of APT-Gen split up: each objective's forward and backward pass and Adam without the others."""
     space, _, config, hparams = problem
-    generator, discriminator = Generator(space.param_spec), Discriminator(space.obs_spec, space.num_actions)
-    value = ValueNetwork(space.param_spec)
+    objectives = make_objectives(space, config)
+    models = state.curriculum.models
 
     def sample(_: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         def rollouts(key: Key[Array, ""], source: int) -> replay.Rollouts:
@@ -151,8 +147,7 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
             )
 
         key_target, key_generated = jax.random.split(key)
-        target, generated = rollouts(key_target, TARGET), rollouts(key_generated, GENERATED)
-        return (), (jax.tree.map(lambda a, b: jnp.concatenate([a, b]), target, generated), generated)
+        return (), (rollouts(key_target, TARGET), rollouts(key_generated, GENERATED))
 
     def descend(loss: Callable[[Any], tuple[Float[Array, ""], Any]], params: Any, opt_state: Any) -> Any:
         grads, aux = jax.grad(loss, has_aux=True)(params)
@@ -162,36 +157,20 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
     def update_discriminator(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         del key
         params, opt_state, spectral = state
-        both, _ = _alternate(fixed, iteration)
-
-        def loss(params: Any) -> tuple[Float[Array, ""], Any]:
-            normal, moved = spectral_normalize(params, spectral, bound=hparams.spectral_bound)
-            steps = both.steps
-            initial = apply(discriminator, normal, both.initial_obs, method="score_init")
-            transitions = apply(
-                discriminator,
-                normal,
-                steps.obs,
-                steps.action,
-                reward=steps.reward,
-                next_obs=steps.next_obs,
-                method="score_step",
-            )
-            return discriminator_loss(*jnp.split(pool(initial, transitions, both.length), 2)), moved
-
-        return descend(loss, params, opt_state), ()
-
-    def evaluate(ensemble: Any, w: Any) -> Float[Array, "K B"]:
-        return jax.vmap(lambda params: apply(value, params, as_instantiated(space.param_spec, w)))(ensemble)
+        target, generated = _alternate(fixed, iteration)
+        params, opt_state, (_, spectral) = descend(
+            lambda params: objectives.discriminator(params, spectral, target, generated, hparams), params, opt_state
+        )
+        return (params, opt_state, spectral), ()
 
     def update_values(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         del key
         _, generated = _alternate(fixed, iteration)
 
-        def loss(params: Any) -> tuple[Float[Array, ""], Any]:
-            outcome = generated.episode_return[None]  # what V1 learns costs the same as what V2 learns
-            errors = jnp.concatenate([evaluate(ensemble, generated.w) - outcome for ensemble in params])
-            return jnp.sum(jnp.mean(errors**2, axis=1)), ()
+        def loss(ensembles: Any) -> tuple[Float[Array, ""], Any]:
+            # What V1 learns costs the same as what V2 learns.
+            losses = [objectives.value(ensemble, generated.w, generated.episode_return)[0] for ensemble in ensembles]
+            return sum(losses, jnp.float32(0.0)), ()
 
         params, opt_state, _ = descend(loss, *state)
         return (params, opt_state), ()
@@ -199,41 +178,22 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
     def update_generator(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         del iteration
         params, opt_state, batch_stats = state
-
-        def loss(params: Any) -> tuple[Float[Array, ""], Any]:
-            z = jax.random.normal(key, (config.model_batch_size, config.noise_size))
-            variables = {"params": params, "batch_stats": batch_stats}
-            w, updated = apply(generator, variables, z, train=True, mutable=["batch_stats"])
-            progress, value = (pessimistic(evaluate(ensemble, w), hparams.pessimism) for ensemble in fixed)
-            return -generator_objective(progress, value, beta=hparams.beta_init, delta=hparams.delta), updated["batch_stats"]
-
-        return descend(loss, params, opt_state), ()
-
-    @jax.jit
-    def init(key: Key[Array, ""]) -> Any:
-        """States of the three updates; how well the networks are trained changes nothing in their cost."""
-        key_d, key_spectral, key_value, key_g = jax.random.split(key, 4)
-        obs, w = zeros_like(obs_struct(space.obs_spec)), zeros_like(param_struct(space.param_spec))
-        params_d: Any = discriminator.init(key_d, obs, jnp.int32(0), reward=jnp.float32(0.0), next_obs=obs)
-        keys = jax.random.split(key_value, (2, config.value_ensemble))
-        progress_value, return_value = (jax.vmap(lambda key: value.init(key, w))(ensemble) for ensemble in keys)
-        values = progress_value, return_value
-        variables = generator.init(key_g, jnp.zeros((2, config.noise_size)), train=True)
-        return (
-            (params_d, _ADAM.init(params_d), init_singular_vectors(key_spectral, params_d)),
-            (values, _ADAM.init(values)),
-            (variables["params"], _ADAM.init(variables["params"]), variables["batch_stats"]),
+        z = jax.random.normal(key, (config.model_batch_size, config.noise_size))
+        params, opt_state, (batch_stats, _) = descend(
+            lambda params: objectives.generator(params, batch_stats, z, fixed, jnp.float32(1.0), hparams), params, opt_state
         )
+        return (params, opt_state, batch_stats), ()
 
-    key_init, key_sample = jax.random.split(jax.random.key(2))
-    discriminator_state, value_state, generator_state = init(key_init)
     record = jax.jit(jax.vmap(sample, in_axes=(None, None, 0, None)))
-    _, rollouts = record((), state.replay, jax.random.split(key_sample), clock.iteration - 1)
+    _, rollouts = record((), state.replay, jax.random.split(jax.random.key(2)), clock.iteration - 1)
+    ensembles = models.progress_value, models.return_value
+    discriminator_state = models.discriminator, _ADAM.init(models.discriminator), state.curriculum.spectral
+    generator_state = models.generator, _ADAM.init(models.generator), state.curriculum.batch_stats
     return {
         "sample rollouts": Part(sample, (), state.replay),
         "discriminator": Part(update_discriminator, discriminator_state, rollouts),
-        "values": Part(update_values, value_state, rollouts),
-        "generator": Part(update_generator, generator_state, value_state[0]),
+        "values": Part(update_values, (ensembles, _ADAM.init(ensembles)), rollouts),
+        "generator": Part(update_generator, generator_state, ensembles),
     }
 
 

@@ -1,0 +1,146 @@
+"""What each network of APT-Gen is trained on, as pure functions of parameters and data (paper, Sec. 3.2 and 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from apt_jax import replay as rp
+from apt_jax.config import Config, HParams
+from apt_jax.losses import discriminator_loss, generator_objective
+from apt_jax.networks import Discriminator, Generator, ValueNetwork, pool, spectral_normalize
+from apt_jax.networks.apply import apply
+from apt_jax.specs import Grid, Params, Spec
+from apt_jax.task_space import TaskSpace
+
+
+class Networks(NamedTuple):
+    """G, D, and the network that both V1 and V2 are ensembles of."""
+
+    generator: Generator
+    discriminator: Discriminator
+    value: ValueNetwork
+
+
+class Objectives(NamedTuple):
+    """Losses to be descended, each by its own parameters alone, and what they are made of.
+
+    Attributes:
+      networks: the modules that the parameters below belong to.
+      generate: `generate(params, batch_stats, z) -> (w, batch_stats)`: tasks of noise [n, noise_size] under the batch's own
+        statistics, and the running statistics moved towards them.
+      score: `score(params, rollouts) -> logits [B]`: the discriminator's pooled logit of each rollout, its layers normalised.
+      evaluate: `evaluate(ensemble, w) -> values [K, n]`: what each network of an ensemble says of tasks (leaves [n, ...]).
+      discriminator: `discriminator(params, spectral, target, generated, hparams) -> (loss, (logits, spectral))`, for rollouts
+        of both sources, logits of the target's and the generated ones, and the power iteration's vectors.
+      value: `value(ensemble, w, outcome) -> (loss, errors [K, B])`, for outcomes [B] of tasks (leaves [B, ...]).
+      generator: `generator(params, batch_stats, z, ensembles, beta, hparams) -> (loss, (batch_stats, values))`, for the
+        ensembles of V1 and V2, and the mean of each over the batch.
+    """
+
+    networks: Networks
+    generate: Callable[..., tuple[Params, Any]]
+    score: Callable[[Any, rp.Rollouts], Float[Array, "B"]]
+    evaluate: Callable[[Any, Params], Float[Array, "K n"]]
+    discriminator: Callable[..., tuple[Float[Array, ""], Any]]
+    value: Callable[..., tuple[Float[Array, ""], Any]]
+    generator: Callable[..., tuple[Float[Array, ""], Any]]
+
+
+def make_objectives(space: TaskSpace, config: Config) -> Objectives:
+    """The objectives for the networks that a task space's specs call for."""
+    networks = Networks(
+        Generator(space.param_spec, blank_bias=config.blank_bias),
+        Discriminator(space.obs_spec, space.num_actions),
+        ValueNetwork(space.param_spec),
+    )
+
+    def generate(params: Any, batch_stats: Any, z: Float[Array, "n z"]) -> tuple[Params, Any]:
+        variables = {"params": params, "batch_stats": batch_stats}
+        w, updated = apply(networks.generator, variables, z, train=True, mutable=["batch_stats"])
+        return w, updated["batch_stats"]
+
+    def score(params: Any, rollouts: rp.Rollouts) -> Float[Array, "B"]:
+        steps = rollouts.steps
+        initial = apply(networks.discriminator, params, rollouts.initial_obs, method="score_init")
+        transitions = apply(
+            networks.discriminator,
+            params,
+            steps.obs,
+            steps.action,
+            reward=steps.reward,
+            next_obs=steps.next_obs,
+            method="score_step",
+        )
+        return pool(initial, transitions, rollouts.length)
+
+    def evaluate(ensemble: Any, w: Params) -> Float[Array, "K n"]:
+        seen = as_instantiated(space.param_spec, w)
+        return jax.vmap(lambda member: apply(networks.value, member, seen))(ensemble)
+
+    def discriminator(
+        params: Any, spectral: Any, target: rp.Rollouts, generated: rp.Rollouts, hparams: HParams
+    ) -> tuple[Float[Array, ""], Any]:
+        normalised, spectral = spectral_normalize(params, spectral, bound=hparams.spectral_bound)
+        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), target, generated)
+        target_logit, generated_logit = jnp.split(score(normalised, both), 2)
+        return discriminator_loss(target_logit, generated_logit), ((target_logit, generated_logit), spectral)
+
+    def value(ensemble: Any, w: Params, outcome: Float[Array, "B"]) -> tuple[Float[Array, ""], Any]:
+        errors = evaluate(ensemble, w) - outcome[None]
+        # A sum over the ensemble: how fast a network learns does not depend on how many there are.
+        return jnp.sum(jnp.mean(errors**2, axis=1)), errors
+
+    def generator(
+        params: Any,
+        batch_stats: Any,
+        z: Float[Array, "n z"],
+        ensembles: tuple[Any, Any],
+        beta: Float[Array, ""],
+        hparams: HParams,
+    ) -> tuple[Float[Array, ""], Any]:
+        w, batch_stats = generate(params, batch_stats, z)
+        progress, outcome = (pessimistic(evaluate(ensemble, w), hparams.pessimism) for ensemble in ensembles)
+        objective = generator_objective(progress, outcome, beta=beta, delta=hparams.delta)
+        return -objective, (batch_stats, (jnp.mean(progress), jnp.mean(outcome)))
+
+    return Objectives(networks, generate, score, evaluate, discriminator, value, generator)
+
+
+def as_instantiated(spec: Spec, w: Params) -> Params:
+    """Replace category scores by the one-hot of their argmax, with the gradient of the scores (straight-through).
+
+    A task shows nothing of its scores but their argmax, so this is what the value networks are to see.
+    """
+
+    def harden(name: str) -> Array:
+        scores = w[name]
+        if not isinstance(spec[name], Grid):
+            return scores
+        one_hot = jax.nn.one_hot(jnp.argmax(scores, axis=-1), scores.shape[-1])
+        return scores + jax.lax.stop_gradient(one_hot - scores)
+
+    return {name: harden(name) for name in w}
+
+
+def task_progress(logit: Float[Array, "n"], temperature: Float[Array, ""] | float, *, relative: bool) -> Float[Array, "n"]:
+    """What V1 learns of the discriminator's logits of n generated rollouts, in [0, 1].
+
+    D itself at temperature 1 (paper).  If `relative`, logits are first centred and scaled to unit spread over the n: their
+    order stays, and the weight of progress against return no longer depends on how far the discriminator has gone.
+    """
+    if relative:
+        logit = (logit - jnp.mean(logit)) / (jnp.std(logit) + 1e-6)
+    return jax.nn.sigmoid(logit / temperature)
+
+
+def pessimistic(values: Float[Array, "K n"], pessimism: Float[Array, ""] | float) -> Float[Array, "n"]:
+    """Mean of an ensemble less `pessimism` standard deviations: where the networks disagree there was little experience."""
+    if values.shape[0] == 1:
+        return values[0]
+    spread = jnp.sqrt(jnp.var(values, axis=0) + 1e-8)  # the root has no gradient at zero
+    return jnp.mean(values, axis=0) - pessimism * spread
