@@ -34,13 +34,21 @@ class Runner:
         self._program = make_program(trainer, self._lanes, layout=layout)
         self._hparams = stack_hparams([experiment.hparams] * self._lanes)
         self._keys = lane_keys(experiment.seeds)
-        self._states = self._program.init(self._keys, self._hparams)
-        self._clock = jax.device_put(Clock.start(), _replicated(self._states))
         self._propose = jax.jit(jax.vmap(trainer.propose, in_axes=(0, 0, None, 0)), static_argnums=2)
+        self._states: TrainState
+        self._clock: Clock
         self._warmup: Callable[..., Any] = self._program.warmup
         self._chunk: Callable[..., Any] = self._program.chunk
         self.generates = trainer.generates
         self.env_steps = 0
+
+    def init(self) -> float:
+        """Fresh states; returns the seconds that compiling and drawing them took.  To be called before anything else."""
+        began = time.monotonic()
+        self._states = self._program.init(self._keys, self._hparams)
+        self._clock = jax.device_put(Clock.start(), _replicated(self._states))
+        jax.block_until_ready(self._states)
+        return time.monotonic() - began
 
     def compile(self) -> float:
         """Compiles what is still to run ahead of time; returns the seconds that took."""

@@ -115,12 +115,13 @@ class Training:
                 self.runner.save(self.run_dir.checkpoints)
 
     def _begin(self) -> None:
+        self.view.note("compiling; the result is kept for later runs")
+        self.times.compile = self._patiently(self.runner.init)
         if checkpoint.latest_step(self.run_dir.checkpoints) is not None:
             self.runner.restore(self.run_dir.checkpoints)
             self.view.note(f"restored {self.runner.env_steps:,} steps")
         if self._unfinished():
-            self.view.note("compiling; the result is kept for later runs")
-            self.times.compile = self._patiently(self.runner.compile)
+            self.times.compile += self._patiently(self.runner.compile)
             self.view.note(f"compiled in {self.times.compile:.1f} s")
         if self.runner.env_steps == 0 and self._unfinished():
             self._patiently(self.runner.warmup)

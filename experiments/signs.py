@@ -1,0 +1,103 @@
+"""How a curriculum unfolded, seed by seed, in a table: `python -m experiments.signs --runs DIR [DIR ...]`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from jaxtyping import Float, Int
+
+from experiments import run_dir
+from experiments.errors import UsageError, exit_with
+
+HEADER = (
+    "run",
+    "seed",
+    "generated return, mean (10th to 90th percentile)",
+    "beta at its lower, upper bound",
+    "shortest solution",
+    "feasible",
+    "tile entropy",
+    "distance of the goal",
+    "V1's correlation",
+    "V2's correlation",
+    "V2's bias",
+)
+
+
+@dataclass(frozen=True)
+class Signs:
+    """Print the curriculum's own signs.
+
+    What changes over training is shown at each quarter of it, as the mean of the five evaluations up to there.
+
+    Attributes:
+      runs: directories of runs with a generator; a run is called by its directory's name.
+      after: environment steps from which the other columns are averaged.
+    """
+
+    runs: tuple[Path, ...]
+    after: int = 20_000
+
+
+def main() -> int:
+    """The command line."""
+    signs = tyro.cli(Signs, prog="python -m experiments.signs", description=__doc__)
+    print(f"| {' | '.join(HEADER)} |")
+    print("|---" * len(HEADER) + "|")
+    for path in signs.runs:
+        config = run_dir.read_config(path)
+        env_steps, curves = run_dir.read_metrics(path)
+        if "beta" not in curves:
+            raise UsageError(f"{path} has no generator: its method is {config['config']['method']}")
+        if env_steps[-1] <= signs.after:
+            raise UsageError(f"--after must be below the {env_steps[-1]:,} steps of {path}, got {signs.after:,}")
+        for lane, seed in enumerate(config["seeds"]):
+            seed_curves = {name: values[lane] for name, values in curves.items()}
+            print(row(path.name, seed, env_steps, seed_curves, signs.after, config["hparams"]))
+    return 0
+
+
+def row(
+    name: str,
+    seed: int,
+    env_steps: Int[np.ndarray, "T"],
+    curves: dict[str, Float[np.ndarray, "T"]],
+    after: int,
+    hparams: dict[str, Any],
+) -> str:
+    """One line of the table; a metric that the task space lacks is a dash."""
+    late = env_steps > after
+    returns = curves["generated_episode_return"][late]
+    low, high = np.nanpercentile(returns, [10, 90])
+    beta = curves["beta"][late]
+    bounds = [np.mean(beta == float(hparams[bound])) for bound in ("beta_min", "beta_max")]
+    cells = (
+        name,
+        str(seed),
+        f"{np.nanmean(returns):.2f} ({low:.2f} to {high:.2f})",
+        ", ".join(f"{share:.0%}" for share in bounds),
+        over_time(curves.get("probe_solution_length"), 1),
+        over_time(curves.get("probe_feasible"), 2),
+        over_time(curves.get("probe_entropy_tiles"), 2),
+        over_time(curves.get("probe_goal_distance"), 1),
+        *(f"{np.nanmean(curves[name][late]):.2f}" for name in ("v1_correlation", "v2_correlation")),
+        f"{np.nanmean(curves['v2_bias'][late]):+.2f}",
+    )
+    return f"| {' | '.join(cells)} |"
+
+
+def over_time(values: Float[np.ndarray, "T"] | None, digits: int) -> str:
+    """A curve at each quarter of its length."""
+    if values is None:
+        return "-"
+    windows = [values[max(0, end - 5) : end] for end in (len(values) * quarter // 4 for quarter in (1, 2, 3, 4))]
+    means = [np.mean(window[np.isfinite(window)]) if np.isfinite(window).any() else np.nan for window in windows]
+    return " ".join(f"{mean:.{digits}f}" for mean in means)
+
+
+if __name__ == "__main__":
+    exit_with(main)

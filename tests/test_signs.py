@@ -1,0 +1,29 @@
+"""The table of a curriculum's signs against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from experiments import signs
+
+
+def test_over_time_takes_the_mean_of_the_five_values_up_to_each_quarter_and_skips_gaps():
+    values = np.arange(40.0)
+    values[39] = np.nan
+    assert signs.over_time(values, 2) == "7.00 17.00 27.00 36.50"
+    assert signs.over_time(np.full(8, np.nan), 1) == "nan nan nan nan"
+    assert signs.over_time(None, 1) == "-"
+
+
+def test_a_row_averages_what_lies_after_the_given_step():
+    env_steps = np.arange(1, 9) * 1_000
+    late = env_steps > 4_000
+    curves = {
+        "generated_episode_return": np.where(late, 0.5, -9.0),
+        "beta": np.array([8.0, 8.0, 8.0, 8.0, 8.0, 0.125, 0.125, 1.0]),
+        "v1_correlation": np.where(late, 0.25, 9.0),
+        "v2_correlation": np.where(late, -0.5, 9.0),
+        "v2_bias": np.where(late, 0.1, 9.0),
+    }
+    row = signs.row("run", 3, env_steps, curves, 4_000, {"beta_min": 0.125, "beta_max": 8.0})
+    assert row == "| run | 3 | 0.50 (0.50 to 0.50) | 50%, 25% | - | - | - | - | 0.25 | -0.50 | +0.10 |"
