@@ -31,7 +31,6 @@ class HParams:
       value_weight_decay: decoupled weight decay of the value networks, per unit of their learning rate, >= 0.
       cell_noise: probability that a cell of a generated grid is played with a uniformly drawn category, in [0, 1] (paper: 0).
       vector_noise: standard deviation of the noise on generated vectors, as a share of their range, >= 0 (paper: 0).
-      progress_temperature: divides the discriminator's logit before the sigmoid that V1 learns, > 0 (paper: 1).
       spectral_bound: upper bound of the spectral norm of every layer of the discriminator, > 0 (paper: none).
     """
 
@@ -53,7 +52,6 @@ class HParams:
     value_weight_decay: float = 0.0
     cell_noise: float = 0.0
     vector_noise: float = 0.0
-    progress_temperature: float = 1.0
     spectral_bound: float = math.inf
 
 
@@ -63,7 +61,7 @@ def check_hparams(hparams: HParams) -> None:
     Raises:
       ValueError: the field, its value, and what is allowed.
     """
-    positive = ("epsilon_steps", "beta_min", "progress_temperature", "spectral_bound")
+    positive = ("epsilon_steps", "beta_min", "spectral_bound")
     not_negative = ("tolerance", "pessimism", "value_weight_decay", "vector_noise")
     rates = ("learning_rate", "discriminator_learning_rate", "value_learning_rate", "generator_learning_rate")
     shares = ("gamma", "target_rate", "epsilon_start", "epsilon_end", "cell_noise")
@@ -146,19 +144,18 @@ PRESETS: dict[str, tuple[Config, HParams]] = {
             episode_share=0.5,
             model_updates_per_step=0.2,
             model_batch_size=64,
-            recent_steps=5_000,
+            recent_steps=20_000,
             relative_progress=True,
             blank_bias=2.0,
             value_ensemble=4,
         ),
         HParams(
             learning_rate=1e-3,
-            generator_learning_rate=7e-4,
+            generator_learning_rate=1e-3,
             gamma=0.97,
             value_weight_decay=10.0,
             cell_noise=0.03,
             vector_noise=0.05,
-            progress_temperature=2.0,
             spectral_bound=0.8,
         ),
     ),

@@ -102,16 +102,16 @@ def test_pessimism_takes_deviations_off_the_mean_and_has_a_gradient_where_all_ag
 
 
 def test_progress_is_the_discriminators_probability():
-    np.testing.assert_allclose(objectives.task_progress(jnp.array([0.0, 6.0]), 2.0, relative=False), [0.5, 0.952574], rtol=1e-5)
+    np.testing.assert_allclose(objectives.task_progress(jnp.array([0.0, 3.0]), relative=False), [0.5, 0.952574], rtol=1e-5)
 
 
 def test_relative_progress_keeps_its_order_and_spread_whatever_the_logits():
     logit = jax.random.normal(jax.random.key(0), (500,))
-    plain = objectives.task_progress(logit, 1.0, relative=True)
-    np.testing.assert_allclose(objectives.task_progress(30.0 * logit - 100.0, 1.0, relative=True), plain, atol=1e-3)
+    plain = objectives.task_progress(logit, relative=True)
+    np.testing.assert_allclose(objectives.task_progress(30.0 * logit - 100.0, relative=True), plain, atol=1e-3)
     np.testing.assert_array_equal(jnp.argsort(plain), jnp.argsort(logit))
     np.testing.assert_allclose((jnp.mean(plain), jnp.std(plain)), (0.5, 0.21), atol=0.01)
-    np.testing.assert_array_equal(objectives.task_progress(jnp.ones(3), 1.0, relative=True), jnp.full(3, 0.5))
+    np.testing.assert_array_equal(objectives.task_progress(jnp.ones(3), relative=True), jnp.full(3, 0.5))
 
 
 def test_correlation():

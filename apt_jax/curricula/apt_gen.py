@@ -112,9 +112,7 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
             loss_d, ((target_logit, generated_logit), spectral) = objectives.discriminator(
                 models.discriminator, state.spectral, target, generated, hparams
             )
-            progress = jax.lax.stop_gradient(
-                task_progress(generated_logit, hparams.progress_temperature, relative=config.relative_progress)
-            )
+            progress = jax.lax.stop_gradient(task_progress(generated_logit, relative=config.relative_progress))
             loss_1, progress_error = objectives.value(models.progress_value, generated.w, progress)
             loss_2, return_error = objectives.value(models.return_value, generated.w, generated.episode_return)
             ensembles = jax.lax.stop_gradient((models.progress_value, models.return_value))
@@ -166,7 +164,7 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
     def report(state: AptGenState, rollouts: rp.Rollouts, hparams: HParams) -> Metrics:
         discriminator, _ = spectral_normalize(state.models.discriminator, state.spectral, bound=hparams.spectral_bound)
         logit = objectives.score(discriminator, rollouts)
-        progress = task_progress(logit, hparams.progress_temperature, relative=config.relative_progress)
+        progress = task_progress(logit, relative=config.relative_progress)
         expected_progress = jnp.mean(objectives.evaluate(state.models.progress_value, rollouts.w), axis=0)
         expected_return = jnp.mean(objectives.evaluate(state.models.return_value, rollouts.w), axis=0)
         return {

@@ -127,15 +127,15 @@ def as_instantiated(spec: Spec, w: Params) -> Params:
     return {name: harden(name) for name in w}
 
 
-def task_progress(logit: Float[Array, "n"], temperature: Float[Array, ""] | float, *, relative: bool) -> Float[Array, "n"]:
+def task_progress(logit: Float[Array, "n"], *, relative: bool) -> Float[Array, "n"]:
     """What V1 learns of the discriminator's logits of n generated rollouts, in [0, 1].
 
-    D itself at temperature 1 (paper).  If `relative`, logits are first centred and scaled to unit spread over the n: their
+    D itself (paper).  If `relative`, logits are first centred and scaled to unit spread over the n: their
     order stays, and the weight of progress against return no longer depends on how far the discriminator has gone.
     """
     if relative:
         logit = (logit - jnp.mean(logit)) / (jnp.std(logit) + 1e-6)
-    return jax.nn.sigmoid(logit / temperature)
+    return jax.nn.sigmoid(logit)
 
 
 def pessimistic(values: Float[Array, "K n"], pessimism: Float[Array, ""] | float) -> Float[Array, "n"]:
