@@ -90,8 +90,8 @@ class Config:
       warmup_steps: steps collected by a uniformly random policy before any update (paper: 10,000).
       updates_per_step: policy updates per environment step (paper: 10).
       batch_size: transitions per policy update, drawn equally from the sources (paper: 128).
-      episode_share: share of a policy update's transitions drawn by episode, so that solved episodes, which are short, weigh as
-        much as those that run into the horizon; the others are drawn uniformly, in [0, 1] (the paper names none: 0).
+      episode_share: share of a policy update's transitions drawn by episode, in [0, 1]: short episodes, solved or
+        fatal, then weigh as much as those that run into the horizon; the others are drawn uniformly (the paper names none: 0).
       n_step: rewards summed up before the Q-learning target bootstraps (the paper names none: 1).
       replay_steps: capacity of each source's replay, in steps of that source.
       replay_episodes: capacity of each source's ring of finished episodes.
@@ -105,7 +105,7 @@ class Config:
       value_ensemble: networks behind each of V1 and V2, whose estimate is their mean less `pessimism` deviations (paper: 1).
       noise_size: length of the generator's noise z.
       refresh_every: steps between updates of beta (paper: 500).
-      return_window: episodes over which the generated return is averaged for beta (paper: 50).
+      return_window: episodes over which the generated return is averaged for beta, those of the warm-up left out (paper: 50).
       eval_every: steps between evaluations; one chunk of the compiled program (paper: 1,000).
       eval_episodes: episodes per evaluation (paper: 50).
       probe_tasks: fresh tasks proposed at each evaluation to judge the curriculum by.

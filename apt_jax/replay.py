@@ -152,8 +152,8 @@ def sample_transitions(
     batch_size: int,
     n_step: int,
     gamma: Float[Array, ""] | float,
-    episode_share: float = 0.0,
-    horizon: int = 0,
+    episode_share: float,
+    horizon: int,
 ) -> Batch:
     """`batches` of `batch_size` n-step transitions in equal shares from the sources; consumes `key`.
 
@@ -161,9 +161,9 @@ def sample_transitions(
 
     Args:
       iteration: the latest iteration written.
-      episode_share: share drawn as a step of a uniformly drawn finished episode, so that short episodes, which are mostly the
-        solved ones, weigh as much as those that run into the horizon; the others are drawn uniformly from all steps.
-      horizon: the longest that an episode can be, for `episode_share`.
+      episode_share: share drawn as a step of a uniformly drawn finished episode, in [0, 1]: short episodes, solved or fatal,
+        then weigh as much as those that run into the horizon; the others are drawn uniformly from all steps.
+      horizon: steps of the longest possible episode; an episode that ended too long ago to be whole is not drawn.
 
     Returns:
       Leaves [batches, batch_size, ...].

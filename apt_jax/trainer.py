@@ -295,7 +295,12 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
         config.batch_size >= sources and config.batch_size % sources == 0,
         f"batch_size must be a positive multiple of the {sources} sources, got {config.batch_size}",
     )
-    require(0.0 <= config.episode_share <= 1.0, f"episode_share must lie in [0, 1], got {config.episode_share:g}")
+    drawn = config.episode_share * (config.batch_size // sources)
+    require(
+        0.0 <= config.episode_share <= 1.0 and (drawn >= 0.5 or drawn == 0.0),
+        f"episode_share must lie in [0, 1] and be 0 or give at least one of {config.batch_size // sources} transitions, "
+        f"got {config.episode_share:g}",
+    )
     require(
         config.warmup_steps >= horizon * steps,
         f"warmup_steps must let every environment finish an episode: at least {horizon * steps}, got {config.warmup_steps}",

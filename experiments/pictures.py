@@ -17,8 +17,8 @@ from experiments.settings import Experiment, target_name
 _COLUMNS, _ROWS = 6, 5
 """Steps and seeds in the picture of the progression, at most."""
 
-_SMALL = 8
-"""Pixels per tile where many boards are shown together."""
+_SAMPLES, _SMALL = 30, 8
+"""Steps, at most, and pixels per tile where all sampled tasks are shown together."""
 
 
 def draw(path: Path, experiment: Experiment, problem: Problem, policies: Any) -> None:
@@ -61,11 +61,12 @@ def draw_progression(path: Path, experiment: Experiment, problem: Problem) -> No
 
 
 def draw_tasks(path: Path, experiment: Experiment, problem: Problem) -> None:
-    """tasks/seed_*.png: all sampled tasks of each seed over time."""
+    """tasks/seed_*.png: the sampled tasks of each seed over time."""
     instantiate = jax.jit(problem.space.instantiate)
     samples = {}
-    for step, file in run_dir.task_files(path).items():
-        with np.load(file) as w:
+    files = run_dir.task_files(path)
+    for step in plots.evenly(list(files), at_most=_SAMPLES):
+        with np.load(files[step]) as w:
             samples[step] = {name: w[name] for name in w}
 
     def picture(w: Params) -> plots.Image:

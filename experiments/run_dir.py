@@ -4,7 +4,7 @@
 * metrics.csv: one row per seed and evaluation
 * summary.json: results, times, versions
 * checkpoints/: the latest state (orbax)
-* tasks/: generated task parameters over time, one npz per sampled step, leaves [seeds, tasks, ...]
+* tasks/: generated task parameters over time, one npz per sampled step, leaves [seeds, tasks, ...], and a picture per seed
 * pictures
 """
 
@@ -121,9 +121,16 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def read_metrics(path: Path) -> tuple[Int[np.ndarray, "T"], Curves]:
-    """The environment steps of every evaluation, and the metrics with `wall_seconds`."""
+    """The environment steps of every evaluation that is there for all seeds, and the metrics with `wall_seconds`.
+
+    Raises:
+      UsageError: no evaluation yet.
+    """
     rows = _read_rows(path)
     seeds = len({row["seed"] for row in rows})
+    rows = rows[: len(rows) - len(rows) % max(seeds, 1)]
+    if not rows:
+        raise UsageError(f"{path} holds no evaluation yet (no rows in metrics.csv)")
     columns = {name: np.array([float(row[name]) for row in rows]).reshape(-1, seeds).T for name in rows[0]}
     return columns.pop("env_steps")[0].astype(int), columns
 
@@ -140,12 +147,12 @@ def task_files(path: Path) -> dict[int, Path]:
 
 
 def _read_rows(path: Path) -> list[dict[str, str]]:
-    """Rows of metrics.csv; a last one that a killed process has left unfinished is not counted."""
+    """Rows of metrics.csv; what a killed process has left of an unfinished line is not one."""
     file = path / "metrics.csv"
     if not file.exists():
         return []
-    with file.open(newline="") as stream:
-        return [row for row in csv.DictReader(stream) if None not in row.values()]
+    lines = file.read_text().splitlines(keepends=True)
+    return list(csv.DictReader(line for line in lines if line.endswith("\n")))
 
 
 def _write_rows(file: Path, rows: Sequence[Mapping[str, object]], mode: str) -> None:

@@ -19,7 +19,7 @@ class Times:
 
     Attributes:
       before: wall seconds of earlier sessions of the same run, until the checkpoint.
-      compile: ahead-of-time compilation of warm-up and chunk.
+      compile: ahead-of-time compilation of init, warm-up and chunk.
       training: chunks, and nothing else.
       trained_steps: environment steps of one seed in these chunks.
       about: versions, device and commit, as they are when the session starts.

@@ -56,8 +56,8 @@ def train(experiment: Experiment, session: Session) -> int:
         Training(experiment, session, runner, run, view, sinks, interrupt, times).run()
         view.stop()
         if run_dir.wall_seconds(run.path):
-            pictures.draw(run.path, experiment, problem, runner.policies)
             run.write_json("summary.json", summarise(run.path, experiment, times))
+            pictures.draw(run.path, experiment, problem, runner.policies)
         if runner.env_steps < experiment.env_steps:
             view.note(f"stopped at {runner.env_steps:,} steps; to go on: {session.resume_command}")
             return EXIT_CODE

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from apt_jax import evaluation
+from apt_jax import replay as rp
 from apt_jax.config import HParams
 from apt_jax.curricula import apt_gen
 from apt_jax.curricula import apt_gen_objectives as objectives
@@ -142,3 +144,65 @@ def test_exploration_replaces_a_share_of_cells_and_jitters_vectors_within_their_
     still = apt_gen.explore(spec, w, jax.random.key(0), HParams(cell_noise=0.0, vector_noise=0.0))
     for name in w:
         np.testing.assert_array_equal(still[name], w[name])
+
+
+def generated_episodes(returns, ends):
+    """A replay whose generated source finished these episodes."""
+    rings = rp.init(SPACE.obs_spec, SPACE.param_spec, sources=2, envs=CONFIG.envs_per_source, columns=100, episodes=64)
+    n = len(returns)
+    episodes = rings.episodes._replace(
+        episode_return=rings.episodes.episode_return.at[1, :n].set(jnp.array(returns)),
+        end=rings.episodes.end.at[1, :n].set(jnp.array(ends, jnp.int32)),
+    )
+    return rings._replace(episodes=episodes, finished=jnp.array([0, n], jnp.int32))
+
+
+@pytest.mark.parametrize(
+    ("returns", "ends", "beta"),
+    [
+        ([-1.0, -1.0, 0.9], [3, 24, 25], 0.5),  # the warm-up lasts 25 iterations of 4 environments
+        ([0.9, 0.9, -1.0], [3, 24, 25], 2.0),
+        ([-1.0, -1.0], [3, 24], 1.0),
+    ],
+)
+def test_beta_follows_only_what_ended_after_the_warm_up(returns, ends, beta):
+    curriculum = apt_gen.make(SPACE, CONFIG)
+    state = jax.eval_shape(curriculum.init, jax.random.key(0), HParams())._replace(beta=jnp.float32(1.0))
+    assert curriculum.refresh(state, generated_episodes(returns, ends), HParams()).beta == beta
+
+
+def test_rollouts_hold_the_steps_of_their_episode_only():
+    goals = jnp.arange(1, 9, dtype=jnp.int32)
+    w = {"goal": goals[:, None].astype(jnp.float32) + 0.5, "paint": jnp.zeros((8, 4, 4, 2))}
+
+    def right(obs, key):
+        del key
+        return jnp.ones(obs["position"].shape[0], jnp.int32)
+
+    outcome, transitions = evaluation.play(SPACE, goals, right, jax.random.key(0))
+    np.testing.assert_array_equal(outcome.length, goals)
+    rollouts = evaluation.sample_rollouts(w, outcome, transitions, jax.random.key(1), steps=200)
+    for task, goal in enumerate(goals):
+        seen = rollouts.steps.obs["position"][task, :, 0]
+        np.testing.assert_array_equal(np.unique(seen), np.arange(goal), err_msg="every step up to the goal, none after")
+        np.testing.assert_array_equal(rollouts.steps.obs["offset"][task, :, 0], goal - seen.astype(jnp.int32))
+    np.testing.assert_array_equal(rollouts.initial_obs["position"][:, 0], 0)
+    np.testing.assert_allclose(rollouts.episode_return, outcome.episode_return)
+
+
+def test_report_compares_each_value_network_with_its_own_truth(monkeypatch):
+    """V2's ensemble knows the return but for a constant."""
+    monkeypatch.setattr(objectives, "ValueNetwork", Bowl)
+    curriculum = apt_gen.make(SPACE, CONFIG)
+    state = curriculum.init(jax.random.key(0), HParams())
+    v1, v2 = ({"params": {"centre": jnp.full(1, c)}} for c in (8.0, 2.0))
+    state = state._replace(models=state.models._replace(progress_value=v1, return_value=v2))
+    goals = jnp.arange(1, 9, dtype=jnp.int32)
+    w = {"goal": goals[:, None].astype(jnp.float32), "paint": jnp.zeros((8, 4, 4, 2))}
+    outcome, transitions = evaluation.play(SPACE, goals, lambda obs, _: jnp.ones(8, jnp.int32), jax.random.key(0))
+    rollouts = evaluation.sample_rollouts(w, outcome, transitions, jax.random.key(1), steps=4)
+    rollouts = rollouts._replace(episode_return=-((goals.astype(jnp.float32) - 2.0) ** 2) / 10.0 - 0.25)
+    report = curriculum.report(state, rollouts, HParams())
+    np.testing.assert_allclose(report["v2_correlation"], 1.0, atol=1e-3)
+    np.testing.assert_allclose(report["v2_bias"], 0.25, atol=1e-4)
+    assert abs(report["v1_correlation"]) < 0.999

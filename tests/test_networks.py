@@ -214,11 +214,12 @@ def test_blank_bias_gives_category_0_a_head_start():
         assert 0.7 < blank < 0.95
 
 
-def test_every_cells_scores_differ_with_noise():
+def test_every_cell_differs_with_noise():
+    """Regression: normalised over cells too, one board for every z met the normalisation."""
     z, variables = noise_and_variables()
     w, _ = generate_train(variables, z)
     for name in ("tiles", "table"):
-        assert (jnp.argmax(w[name], axis=-1).std(axis=0) > 0.1).all()
+        assert (jnp.argmax(w[name], axis=-1).std(axis=0) > 0.5).all()
 
 
 def test_generator_outputs_differ_with_noise():

@@ -91,7 +91,15 @@ def test_return_range_covers_finished_episodes_of_all_sources_and_is_unbounded_b
 def test_sampled_transitions_are_whole_recent_and_equally_shared(iterations):
     rings, _ = _written(iterations)
     batch = replay.sample_transitions(
-        rings, jax.random.key(1), jnp.int32(iterations - 1), batches=50, batch_size=64, n_step=1, gamma=0.5
+        rings,
+        jax.random.key(1),
+        jnp.int32(iterations - 1),
+        batches=50,
+        batch_size=64,
+        n_step=1,
+        gamma=0.5,
+        episode_share=0.0,
+        horizon=1,
     )
     code = np.asarray(batch.reward)
     assert code.shape == (50, 64)
@@ -137,7 +145,15 @@ def test_n_step_transitions_stop_at_the_end_of_the_episode_and_of_what_is_writte
     rings, _ = _written(iterations)
     stored = jax.tree.map(np.asarray, rings.transitions)
     batch = replay.sample_transitions(
-        rings, jax.random.key(1), jnp.int32(iterations - 1), batches=20, batch_size=64, n_step=n_step, gamma=gamma
+        rings,
+        jax.random.key(1),
+        jnp.int32(iterations - 1),
+        batches=20,
+        batch_size=64,
+        n_step=n_step,
+        gamma=gamma,
+        episode_share=0.0,
+        horizon=1,
     )
     batch = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[2:]), batch)
     spans = set()

@@ -120,6 +120,21 @@ def test_the_resume_command_repeats_how_not_what(tmp_path):
     assert session.resume_command == ("python -m experiments.train --run-dir 'my run' --resume --devices 1 --sinks tensorboard")
 
 
+@pytest.mark.parametrize("kept", range(1, 60, 7))
+def test_metrics_cut_off_anywhere_are_read_up_to_the_last_evaluation_of_all_seeds(tmp_path, kept):
+    run = RunDir.create(tmp_path / "run", {}, None)
+    with pytest.raises(UsageError, match="no evaluation yet"):
+        run_dir.read_metrics(run.path)
+    for step in (100, 200):
+        run.append_metrics(step, 0.5, [4, 2], {"target_return": np.float32([0.25, -0.25])})
+    whole = (run.path / "metrics.csv").read_text()
+    second = whole.index("4,200")
+    (run.path / "metrics.csv").write_text(whole[: second + min(kept, len(whole) - second - 1)])
+    env_steps, curves = run_dir.read_metrics(run.path)
+    assert env_steps.tolist() == [100]
+    np.testing.assert_array_equal(curves["target_return"], [[0.25], [-0.25]])
+
+
 def test_rewinding_drops_what_came_after_the_checkpoint(tmp_path):
     run = RunDir.create(tmp_path / "run", {}, None)
     for step in (100, 200, 300):
@@ -167,7 +182,7 @@ def test_an_interrupted_run_resumes_as_if_nothing_happened(tmp_path, capsys):
     assert command
     assert len(rows_without_time(run)) < 3 * 10
     with (run / "metrics.csv").open("a") as stream:
-        stream.write("3,1160,2.5,0.")  # as a process killed while writing leaves it
+        stream.write("3,1")  # as a process killed while writing leaves it
 
     with launch(*shlex.split(command[1])) as process:
         process.communicate()
@@ -180,7 +195,7 @@ def test_an_interrupted_run_resumes_as_if_nothing_happened(tmp_path, capsys):
     assert len(rows_without_time(run)) == 3 * 10
     summary = json.loads((run / "summary.json").read_text())
     assert list(summary["seeds"]) == ["3", "0", "5"]
-    for name in ("learning_curves.png", "progression.png", "policy.gif"):
+    for name in ("learning_curves.png", "progression.png", "policy.gif", "tasks/seed_3.png"):
         assert (run / name).stat().st_size > 1000
 
     assert train.train(*settings.parse(["--run-dir", str(run), "--resume"])) == 0

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import envs
 from apt_jax import checkpoint
-from apt_jax.config import Config, HParams
+from apt_jax.config import PRESETS, Config, HParams
 from apt_jax.lanes import make_program, stack_hparams
 from apt_jax.trainer import Clock, diversity, make_trainer
 from tests.corridor import Corridor
@@ -34,6 +35,8 @@ CONFIG = Config(
     probe_tasks=8,
     return_window=10,
 )
+SWITCHES = {"relative_progress": True, "blank_bias": 2.0, "episode_share": 0.5, "value_ensemble": 2}
+"""What preset "fast" has beyond the paper."""
 METHODS = ("apt_gen", "random", "target_only")
 
 
@@ -72,9 +75,16 @@ def assert_lane_equal(several, lane, alone, rtol=1e-4, atol=1e-5):
         np.testing.assert_allclose(a[lane], b[0], rtol=rtol, atol=atol)
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_makes_a_trainer(preset):
+    make_trainer(envs.make("grid_world"), envs.load_target("grid_world", "A"), PRESETS[preset][0])
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_metrics_are_finite_and_the_clock_counts_every_source(method):
-    _, clock, history = run(config(method), [0, 1])
+    """With everything switched on; the other tests run the paper's form."""
+    _, hparams = PRESETS["fast"]
+    _, clock, history = run(config(method, **SWITCHES), [0, 1], hparams=[hparams] * 2)
     assert clock.env_steps == 180
     assert clock.iteration == (90 if method == "target_only" else 45)
     for metrics in history:
@@ -187,7 +197,7 @@ def test_every_method_learns_a_shorter_corridor(method):
 @pytest.mark.parametrize("stop", [0, 1, 2])
 def test_resuming_from_a_checkpoint_equals_never_having_stopped(tmp_path, stop):
     """Bit for bit, in every leaf of the state, whichever chunk was the last before the stop."""
-    cfg = config("apt_gen")
+    cfg = config("apt_gen", **SWITCHES)
     straight, straight_clock, _ = run(cfg, [0, 1], chunks=3)
     states, clock, _ = run(cfg, [0, 1], chunks=stop)
     checkpoint.save(tmp_path, int(clock.env_steps), (states, clock))
@@ -213,6 +223,8 @@ def test_resuming_from_a_checkpoint_equals_never_having_stopped(tmp_path, stop):
         ({"warmup_steps": 40}, "warmup_steps .* at least 48, got 40"),
         ({"model_updates_per_step": 0.3}, "whole number of updates"),
         ({"replay_steps": 100}, "replay_steps .* at least 124"),
+        ({"episode_share": 1.5}, "episode_share must lie in"),
+        ({"episode_share": 0.01}, "at least one of 8 transitions, got 0.01"),
         ({"envs_per_source": 0}, "envs_per_source"),
         ({"eval_episodes": 0}, "eval_episodes must be at least 1"),
     ],

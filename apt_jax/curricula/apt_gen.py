@@ -109,14 +109,14 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
 
         def loss(models: Models) -> tuple[Float[Array, ""], tuple[Any, Any, Metrics]]:
             """All four objectives: each parameter group receives the gradient of its own alone."""
-            loss_d, ((target_logit, generated_logit), spectral) = objectives.discriminator(
+            loss_d, ((target_logit, generated_logit), spectral) = objectives.discriminator_loss(
                 models.discriminator, state.spectral, target, generated, hparams
             )
             progress = jax.lax.stop_gradient(task_progress(generated_logit, relative=config.relative_progress))
-            loss_1, progress_error = objectives.value(models.progress_value, generated.w, progress)
-            loss_2, return_error = objectives.value(models.return_value, generated.w, generated.episode_return)
+            loss_1, progress_error = objectives.value_loss(models.progress_value, generated.w, progress)
+            loss_2, return_error = objectives.value_loss(models.return_value, generated.w, generated.episode_return)
             ensembles = jax.lax.stop_gradient((models.progress_value, models.return_value))
-            loss_g, (batch_stats, (progress_value, return_value)) = objectives.generator(
+            loss_g, (batch_stats, (progress_value, return_value)) = objectives.generator_loss(
                 models.generator, state.batch_stats, z, ensembles, state.beta, hparams
             )
             metrics = {

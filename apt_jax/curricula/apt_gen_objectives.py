@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from apt_jax import losses
 from apt_jax import replay as rp
 from apt_jax.config import Config, HParams
-from apt_jax.losses import discriminator_loss, generator_objective
 from apt_jax.networks import Discriminator, Generator, ValueNetwork, pool, spectral_normalize
 from apt_jax.networks.apply import apply
 from apt_jax.specs import Grid, Params, Spec
@@ -33,22 +33,23 @@ class Objectives(NamedTuple):
       networks: the modules that the parameters below belong to.
       generate: `generate(params, batch_stats, z) -> (w, batch_stats)`: tasks of noise [n, noise_size] under the batch's own
         statistics, and the running statistics moved towards them.
-      score: `score(params, rollouts) -> logits [B]`: the discriminator's pooled logit of each rollout, its layers normalised.
+      score: `score(params, rollouts) -> logits [B]`: the discriminator's pooled logit of each rollout, from parameters that are
+        spectrally normalised already.
       evaluate: `evaluate(ensemble, w) -> values [K, n]`: what each network of an ensemble says of tasks (leaves [n, ...]).
-      discriminator: `discriminator(params, spectral, target, generated, hparams) -> (loss, (logits, spectral))`, for rollouts
-        of both sources, logits of the target's and the generated ones, and the power iteration's vectors.
-      value: `value(ensemble, w, outcome) -> (loss, errors [K, B])`, for outcomes [B] of tasks (leaves [B, ...]).
-      generator: `generator(params, batch_stats, z, ensembles, beta, hparams) -> (loss, (batch_stats, values))`, for the
-        ensembles of V1 and V2, and the mean of each over the batch.
+      discriminator_loss: `discriminator_loss(params, spectral, target, generated, hparams) -> (loss, (logits, spectral))`, for
+        rollouts of both sources, logits of the target's and the generated ones, and the power iteration's vectors.
+      value_loss: `value_loss(ensemble, w, outcome) -> (loss, errors [K, B])`, for outcomes [B] of tasks w (leaves [B, ...]).
+      generator_loss: `generator_loss(params, batch_stats, z, ensembles, beta, hparams) -> (loss, (batch_stats, values))`, for
+        the ensembles of V1 and V2, and the mean of each over the batch.
     """
 
     networks: Networks
     generate: Callable[..., tuple[Params, Any]]
     score: Callable[[Any, rp.Rollouts], Float[Array, "B"]]
     evaluate: Callable[[Any, Params], Float[Array, "K n"]]
-    discriminator: Callable[..., tuple[Float[Array, ""], Any]]
-    value: Callable[..., tuple[Float[Array, ""], Any]]
-    generator: Callable[..., tuple[Float[Array, ""], Any]]
+    discriminator_loss: Callable[..., tuple[Float[Array, ""], Any]]
+    value_loss: Callable[..., tuple[Float[Array, ""], Any]]
+    generator_loss: Callable[..., tuple[Float[Array, ""], Any]]
 
 
 def make_objectives(space: TaskSpace, config: Config) -> Objectives:
@@ -82,20 +83,20 @@ def make_objectives(space: TaskSpace, config: Config) -> Objectives:
         seen = as_instantiated(space.param_spec, w)
         return jax.vmap(lambda member: apply(networks.value, member, seen))(ensemble)
 
-    def discriminator(
+    def discriminator_loss(
         params: Any, spectral: Any, target: rp.Rollouts, generated: rp.Rollouts, hparams: HParams
     ) -> tuple[Float[Array, ""], Any]:
         normalised, spectral = spectral_normalize(params, spectral, bound=hparams.spectral_bound)
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), target, generated)
         target_logit, generated_logit = jnp.split(score(normalised, both), 2)
-        return discriminator_loss(target_logit, generated_logit), ((target_logit, generated_logit), spectral)
+        return losses.discriminator_loss(target_logit, generated_logit), ((target_logit, generated_logit), spectral)
 
-    def value(ensemble: Any, w: Params, outcome: Float[Array, "B"]) -> tuple[Float[Array, ""], Any]:
+    def value_loss(ensemble: Any, w: Params, outcome: Float[Array, "B"]) -> tuple[Float[Array, ""], Any]:
         errors = evaluate(ensemble, w) - outcome[None]
         # A sum over the ensemble: how fast a network learns does not depend on how many there are.
         return jnp.sum(jnp.mean(errors**2, axis=1)), errors
 
-    def generator(
+    def generator_loss(
         params: Any,
         batch_stats: Any,
         z: Float[Array, "n z"],
@@ -105,10 +106,10 @@ def make_objectives(space: TaskSpace, config: Config) -> Objectives:
     ) -> tuple[Float[Array, ""], Any]:
         w, batch_stats = generate(params, batch_stats, z)
         progress, outcome = (pessimistic(evaluate(ensemble, w), hparams.pessimism) for ensemble in ensembles)
-        objective = generator_objective(progress, outcome, beta=beta, delta=hparams.delta)
+        objective = losses.generator_objective(progress, outcome, beta=beta, delta=hparams.delta)
         return -objective, (batch_stats, (jnp.mean(progress), jnp.mean(outcome)))
 
-    return Objectives(networks, generate, score, evaluate, discriminator, value, generator)
+    return Objectives(networks, generate, score, evaluate, discriminator_loss, value_loss, generator_loss)
 
 
 def as_instantiated(spec: Spec, w: Params) -> Params:

@@ -11,7 +11,7 @@ import optax
 from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import learner, replay, workers
-from apt_jax.curricula import make_curriculum
+from apt_jax.curricula import apt_gen, make_curriculum
 from apt_jax.curricula.apt_gen_objectives import make_objectives
 from apt_jax.curricula.base import GENERATED, TARGET
 from apt_jax.networks import QNetwork
@@ -132,7 +132,9 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
     """One model update of APT-Gen split up: each objective's forward and backward pass and Adam without the others."""
     space, _, config, hparams = problem
     objectives = make_objectives(space, config)
-    models = state.curriculum.models
+    # Fresh: how well the networks are trained changes nothing in their cost.
+    fresh = jax.jit(apt_gen.make(space, config).init)(jax.random.key(3), hparams)
+    models = fresh.models
 
     def sample(_: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         def rollouts(key: Key[Array, ""], source: int) -> replay.Rollouts:
@@ -159,7 +161,7 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
         params, opt_state, spectral = state
         target, generated = _alternate(fixed, iteration)
         params, opt_state, (_, spectral) = descend(
-            lambda params: objectives.discriminator(params, spectral, target, generated, hparams), params, opt_state
+            lambda params: objectives.discriminator_loss(params, spectral, target, generated, hparams), params, opt_state
         )
         return (params, opt_state, spectral), ()
 
@@ -169,7 +171,7 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
 
         def loss(ensembles: Any) -> tuple[Float[Array, ""], Any]:
             # What V1 learns costs the same as what V2 learns.
-            losses = [objectives.value(ensemble, generated.w, generated.episode_return)[0] for ensemble in ensembles]
+            losses = [objectives.value_loss(ensemble, generated.w, generated.episode_return)[0] for ensemble in ensembles]
             return sum(losses, jnp.float32(0.0)), ()
 
         params, opt_state, _ = descend(loss, *state)
@@ -180,15 +182,17 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
         params, opt_state, batch_stats = state
         z = jax.random.normal(key, (config.model_batch_size, config.noise_size))
         params, opt_state, (batch_stats, _) = descend(
-            lambda params: objectives.generator(params, batch_stats, z, fixed, jnp.float32(1.0), hparams), params, opt_state
+            lambda params: objectives.generator_loss(params, batch_stats, z, fixed, jnp.float32(1.0), hparams),
+            params,
+            opt_state,
         )
         return (params, opt_state, batch_stats), ()
 
     record = jax.jit(jax.vmap(sample, in_axes=(None, None, 0, None)))
     _, rollouts = record((), state.replay, jax.random.split(jax.random.key(2)), clock.iteration - 1)
     ensembles = models.progress_value, models.return_value
-    discriminator_state = models.discriminator, _ADAM.init(models.discriminator), state.curriculum.spectral
-    generator_state = models.generator, _ADAM.init(models.generator), state.curriculum.batch_stats
+    discriminator_state = models.discriminator, _ADAM.init(models.discriminator), fresh.spectral
+    generator_state = models.generator, _ADAM.init(models.generator), fresh.batch_stats
     return {
         "sample rollouts": Part(sample, (), state.replay),
         "discriminator": Part(update_discriminator, discriminator_state, rollouts),
