@@ -1,8 +1,8 @@
 """Many seeds and hyper-parameters as lanes of one compiled program.
 
 A lane is one (key, HParams).  The functions of `apt_jax.trainer` know nothing of lanes; here they are batched, sharded over
-devices and jitted.  Within a device, lanes run side by side ("vmap", best on accelerators) or one after another ("map": on CPU its
-time per seed does not grow with their number, which under "vmap" it does; BENCHMARKS.md, "Many seeds").
+devices and jitted.  Within a device, lanes run side by side ("vmap", best on accelerators) or one after another ("map": on CPU
+its time per seed does not grow with their number, under "vmap" it does; BENCHMARKS.md, "Many seeds").
 """
 
 from __future__ import annotations
