@@ -297,7 +297,7 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
     )
     drawn = config.episode_share * (config.batch_size // sources)
     require(
-        0.0 <= config.episode_share <= 1.0 and (drawn >= 0.5 or drawn == 0.0),
+        0.0 <= config.episode_share <= 1.0 and (round(drawn) >= 1 or drawn == 0.0),
         f"episode_share must lie in [0, 1] and be 0 or give at least one of {config.batch_size // sources} transitions, "
         f"got {config.episode_share:g}",
     )
