@@ -265,7 +265,7 @@ def sample_rollouts(
 
 
 def recent_outcome(replay: Replay, *, source: int, window: int, since: int = 0) -> dict[str, Any]:
-    """Mean return, success rate and length of a source's last `window` episodes that ended at or after iteration `since`.
+    """Mean return, success rate and length of those of a source's last `window` episodes that began at iteration `since` or later.
 
     NaN before the first.
     """
@@ -273,7 +273,8 @@ def recent_outcome(replay: Replay, *, source: int, window: int, since: int = 0) 
     count = jnp.minimum(replay.finished[source], window)
     back = jnp.arange(window, dtype=jnp.int32)
     slot = (replay.finished[source] - 1 - back) % slots
-    valid = (back < count) & (replay.episodes.end[source, slot] >= since)
+    began = replay.episodes.end[source, slot] - replay.episodes.length[source, slot] + 1
+    valid = (back < count) & (began >= since)
 
     def mean(values: Array) -> Array:
         return jnp.mean(values[source, slot].astype(jnp.float32), where=valid)

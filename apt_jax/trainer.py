@@ -198,7 +198,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             "target_return_raw": score,
             "target_success_raw": jnp.mean(outcome.success.astype(jnp.float32)),
             "restored": restored.astype(jnp.float32),
-            **_sources(state.replay, config.return_window),
+            **_sources(state.replay, config.return_window, since=config.warmup_steps // steps),
         }
         if curriculum.generates:
             epsilon = learner.epsilon_schedule(clock.env_steps - config.warmup_steps, hparams)
@@ -360,13 +360,13 @@ def diversity(spec: Spec, w: Params) -> Metrics:
     return metrics
 
 
-def _sources(rings: replay.Replay, window: int) -> Metrics:
-    """Recent outcome of each source as the behaviour policy had it."""
+def _sources(rings: replay.Replay, window: int, since: int) -> Metrics:
+    """Recent outcome of each source as the behaviour policy had it after the warm-up."""
     names = {TARGET: "behaviour", GENERATED: "generated"}
     return {
         f"{names[source]}_{name}": value
         for source in range(rings.finished.shape[0])
-        for name, value in replay.recent_outcome(rings, source=source, window=window).items()
+        for name, value in replay.recent_outcome(rings, source=source, window=window, since=since).items()
     }
 
 

@@ -209,11 +209,11 @@ def test_recent_outcome_is_the_mean_of_the_last_episodes_only():
     assert np.isnan(replay.recent_outcome(empty, source=0, window=4)["episode_return"])
 
 
-def test_recent_outcome_leaves_out_what_ended_too_early():
+def test_recent_outcome_leaves_out_what_began_too_early():
     rings, finished = _written(41)
     since = finished[1][-3][1]
-    recent = [episode[3] for episode in finished[1] if episode[1] >= since]
+    recent = [episode_return for _, end, length, episode_return in finished[1] if end - length + 1 >= since]
     outcome = replay.recent_outcome(rings, source=1, window=SLOTS, since=since)
-    assert 3 <= len(recent) < SLOTS
+    assert 0 < len(recent) < sum(end >= since for _, end, _, _ in finished[1]) < SLOTS
     np.testing.assert_allclose(outcome["episode_return"], np.mean(recent), rtol=1e-6)
     assert np.isnan(replay.recent_outcome(rings, source=1, window=SLOTS, since=41)["episode_return"])
