@@ -265,7 +265,7 @@ def sample_rollouts(
 
 
 def recent_outcome(replay: Replay, *, source: int, window: int, since: int = 0) -> dict[str, Any]:
-    """Mean return, success rate and length of those of a source's last `window` episodes that began at iteration `since` or later.
+    """Mean return, success rate and length of those of a source's last `window` episodes that began at `since` or later.
 
     NaN before the first.
     """
