@@ -3,8 +3,8 @@
 Absolute learning progress (ALP) of an episode is how far its return lies from that of the nearest earlier task.  Mixtures are
 fitted to the latest tasks with their progress, and tasks are drawn from components in proportion to the progress there.
 
-In many dimensions that is a weak guide: a full covariance of Grid-World's 203 numbers and the progress has 20,910 entries, to be
-told from 250 episodes.  The weakness is the method's own.
+In many dimensions that is a weak guide: a full covariance of Grid-World's 203 numbers and the progress has 20,910 entries, to
+be told from 250 episodes.  The weakness is the method's own.
 """
 
 from __future__ import annotations
@@ -76,9 +76,8 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
         rows = jnp.concatenate([w[: config.alp_window], progress[:, None]], axis=1)
         valid = earlier[: config.alp_window] >= 0
 
-        def fitted(args: tuple[Int[Array, ""], Key[Array, ""]]) -> tuple[Mixture, Float[Array, ""]]:
-            k, key = args
-            labels = k_means(rows, valid, k, key, slots=MOST_COMPONENTS)
+        def fitted(k: Int[Array, ""]) -> tuple[Mixture, Float[Array, ""]]:
+            labels = k_means(rows, valid, k, jax.random.fold_in(key, k), slots=MOST_COMPONENTS)
             result = fit(
                 rows,
                 valid,
@@ -92,7 +91,7 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
 
         candidates = jnp.array(COMPONENTS, jnp.int32)
         # One after another: each stops when it has converged, all at once would wait for the slowest.
-        mixtures, aic = jax.lax.map(fitted, (candidates, jax.random.split(key, len(COMPONENTS))))
+        mixtures, aic = jax.lax.map(fitted, candidates)
         best = jnp.argmin(aic)
         usable = jnp.all(valid) & jnp.isfinite(aic[best])
         new = AlpGmmState(jax.tree.map(lambda x: x[best], mixtures), candidates[best], jnp.mean(progress))
