@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import flax.struct
 
@@ -32,6 +34,18 @@ class HParams:
       cell_noise: probability that a cell of a generated grid is played with a uniformly drawn category, in [0, 1] (paper: 0).
       vector_noise: standard deviation of the noise on generated vectors, as a share of their range, >= 0 (paper: 0).
       spectral_bound: upper bound of the spectral norm of every layer of the discriminator, > 0 (paper: none).
+      bonus_learning_rate: Adam step size of the networks behind an intrinsic reward, >= 0 (paper: 3e-4; RND's own 1e-4).
+      icm_scale: factor on ICM's reward, >= 0 (its reference 0.01).
+      rnd_scale: factor on RND's reward, >= 0 (its reference 1 beside rewards from the environment times 2).
+      ride_scale: factor on RIDE's reward, >= 0 (its reference 0.1 to 0.5).
+      alp_random_share: share of uniform tasks in ALP-GMM, in [0, 1] (its reference 0.2).
+      alp_regularisation: added to the diagonal of ALP-GMM's covariances, where every block of a task parameter spans a length
+        of 1, > 0 (scikit-learn 1e-6; below 1e-6 float32 has no Cholesky factors of 204 dimensions).
+      goal_low: GoalGAN's lowest rate of success of a task worth proposing, in [0, 1] (its reference 0.25).
+      goal_high: the highest such rate, in [0, 1] (its reference 0.75).
+      goal_old_share: share of earlier such tasks, proposed again, in [0, 1] (its reference 0.2).
+      goal_noise: standard deviation of the noise on GoalGAN's tasks, whose numbers lie in [-1, 1], >= 0 (its reference 0.01).
+      goal_learning_rate: RMSProp step size of GoalGAN's two networks, >= 0 (its reference 1e-3).
     """
 
     learning_rate: float = 3e-4
@@ -53,6 +67,17 @@ class HParams:
     cell_noise: float = 0.0
     vector_noise: float = 0.0
     spectral_bound: float = math.inf
+    bonus_learning_rate: float = 3e-4
+    icm_scale: float = 0.01
+    rnd_scale: float = 1.0
+    ride_scale: float = 0.1
+    alp_random_share: float = 0.2
+    alp_regularisation: float = 1e-5
+    goal_low: float = 0.25
+    goal_high: float = 0.75
+    goal_old_share: float = 0.2
+    goal_noise: float = 0.01
+    goal_learning_rate: float = 1e-3
 
 
 def check_hparams(hparams: HParams) -> None:
@@ -61,13 +86,24 @@ def check_hparams(hparams: HParams) -> None:
     Raises:
       ValueError: the field, its value, and what is allowed.
     """
-    positive = ("epsilon_steps", "beta_min", "spectral_bound")
-    not_negative = ("tolerance", "pessimism", "value_weight_decay", "vector_noise")
-    rates = ("learning_rate", "discriminator_learning_rate", "value_learning_rate", "generator_learning_rate")
-    shares = ("gamma", "target_rate", "epsilon_start", "epsilon_end", "cell_noise")
+    positive = ("epsilon_steps", "beta_min", "spectral_bound", "alp_regularisation")
+    not_negative = ("tolerance", "pessimism", "value_weight_decay", "vector_noise", "goal_noise")
+    rates = tuple(field.name for field in dataclasses.fields(hparams) if field.name.endswith("learning_rate"))
+    scales = ("icm_scale", "rnd_scale", "ride_scale")
+    shares = (
+        "gamma",
+        "target_rate",
+        "epsilon_start",
+        "epsilon_end",
+        "cell_noise",
+        "alp_random_share",
+        "goal_low",
+        "goal_high",
+        "goal_old_share",
+    )
     ranges = {
         **dict.fromkeys(positive, (math.ulp(0.0), math.inf, "above 0")),
-        **dict.fromkeys(not_negative + rates, (0.0, math.inf, "at least 0")),
+        **dict.fromkeys(not_negative + rates + scales, (0.0, math.inf, "at least 0")),
         **dict.fromkeys(shares, (0.0, 1.0, "in [0, 1]")),
     }
     for name, (low, high, allowed) in ranges.items():
@@ -76,6 +112,8 @@ def check_hparams(hparams: HParams) -> None:
             raise ValueError(f"{name} must be {allowed}, got {value:g}")
     if not hparams.beta_min <= hparams.beta_init <= hparams.beta_max:
         raise ValueError(f"beta_init must lie in [beta_min, beta_max], got {hparams.beta_init:g}")
+    if hparams.goal_low > hparams.goal_high:
+        raise ValueError(f"goal_low must be at most goal_high={hparams.goal_high:g}, got {hparams.goal_low:g}")
 
 
 @dataclass(frozen=True)
@@ -85,7 +123,7 @@ class Config:
     "Steps" are environment steps of all sources together unless a field says otherwise.
 
     Attributes:
-      method: the curriculum's name in `apt_jax.curricula.METHODS`.
+      method: a name in `apt_jax.methods.METHODS`, or such a name and that of an intrinsic reward, as in "apt_gen+rnd".
       envs_per_source: environments side by side in each source (target, generated).
       warmup_steps: steps collected by a uniformly random policy before any update (paper: 10,000).
       updates_per_step: policy updates per environment step (paper: 10).
@@ -104,6 +142,14 @@ class Config:
       blank_bias: head start of category 0 in the generator's initial grids, in standard deviations of the scores (paper: 0).
       value_ensemble: networks behind each of V1 and V2, whose estimate is their mean less `pessimism` deviations (paper: 1).
       noise_size: length of the generator's noise z.
+      alp_window: finished episodes that ALP-GMM fits its mixtures to; until there are so many, tasks are uniform (its reference
+        250).
+      alp_history: earlier episodes among which it looks for the task nearest to each of these (its reference: all).
+      alp_fit_every: steps between fits, a multiple of `refresh_every` (its reference: every 250 episodes).
+      alp_covariance: "full", or "diagonal" where a task parameter has many more numbers than `alp_window` can tell.
+      goal_rollouts: episodes by which GoalGAN judges a task (its reference 2).
+      goal_tasks: latest tasks that its networks learn from (its reference 100).
+      goal_memory: earlier good tasks that it may propose again.
       refresh_every: steps between updates of beta (paper: 500).
       return_window: episodes over which the generated return is averaged for beta, those of the warm-up left out (paper: 50).
       eval_every: steps between evaluations; one chunk of the compiled program (paper: 1,000).
@@ -128,6 +174,13 @@ class Config:
     blank_bias: float = 0.0
     value_ensemble: int = 1
     noise_size: int = 32
+    alp_window: int = 250
+    alp_history: int = 2_000
+    alp_fit_every: int = 5_000
+    alp_covariance: Literal["full", "diagonal"] = "full"
+    goal_rollouts: int = 2
+    goal_tasks: int = 100
+    goal_memory: int = 1_000
     refresh_every: int = 500
     return_window: int = 50
     eval_every: int = 1_000

@@ -45,31 +45,42 @@ def stack_hparams(hparams: Sequence[HParams]) -> HParams:
 
 
 def make_program(
-    trainer: Trainer, lanes: int, *, layout: Layout = "auto", devices: Sequence[jax.Device] | None = None
+    trainer: Trainer,
+    lanes: int,
+    *,
+    layout: Layout = "auto",
+    at_once: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
 ) -> Program:
     """Batch a trainer over `lanes`.
 
     Args:
       layout: how the lanes of one device are laid out; "auto" is "map" on CPU and "vmap" elsewhere.
+      at_once: lanes of one device that "vmap" puts side by side, the others in turn, if not all fit its memory; all by default.
       devices: what to shard lanes over, by default every device; no more are used than there are lanes.
 
     Raises:
-      ValueError: fewer than one lane.
+      ValueError: fewer than one lane, or than one at once.
     """
-    if lanes < 1:
-        raise ValueError(f"A program needs at least one lane, got {lanes}")
+    if lanes < 1 or (at_once is not None and at_once < 1):
+        raise ValueError(f"a program needs at least one lane and one at once, got {lanes} and {at_once}")
     used = list(devices or jax.devices())[:lanes]
     if layout == "auto":
         layout = "map" if used[0].platform == "cpu" else "vmap"
     mesh = Mesh(np.array(used), ("lane",))
     lane, shared = PartitionSpec("lane"), PartitionSpec()
+    per_device = -(-lanes // len(used))
+    width = 1 if layout == "map" else min(at_once or per_device, per_device)
     padded = np.minimum(np.arange(lanes + -lanes % len(used)), lanes - 1)
 
     def pad(tree: Any) -> Any:
         return jax.tree.map(lambda x: x[padded], tree)
 
     def over_lanes(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
-        batched = _vmap(function, in_specs, out_specs) if layout == "vmap" else _map(function, in_specs, out_specs)
+        if width == per_device and layout == "vmap":
+            batched = _vmap(function, in_specs, out_specs)
+        else:
+            batched = _map(function, in_specs, out_specs, width=width)
         return jax.shard_map(batched, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
 
     init = over_lanes(trainer.init, (lane, lane), lane)
@@ -104,8 +115,8 @@ def _vmap(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callab
     return jax.vmap(function, in_axes=_axes(in_specs), out_axes=_axes(out_specs))
 
 
-def _map(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
-    """Like `_vmap`, one lane after another."""
+def _map(function: Callable[..., Any], in_specs: Any, out_specs: Any, *, width: int) -> Callable[..., Any]:
+    """Like `_vmap`, `width` lanes after `width` others."""
     batched = [axis == 0 for axis in _axes(in_specs)]
 
     def mapped(*args: Any) -> Any:
@@ -113,7 +124,8 @@ def _map(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callabl
             rest = iter(lane_args)
             return function(*(next(rest) if b else arg for b, arg in zip(batched, args, strict=True)))
 
-        out = jax.lax.map(one, [arg for b, arg in zip(batched, args, strict=True) if b])
+        lane_args = [arg for b, arg in zip(batched, args, strict=True) if b]
+        out = jax.lax.map(one, lane_args, batch_size=None if width == 1 else width)
         if not isinstance(out_specs, tuple):
             return out
         # What is shared came out once per lane, all alike.

@@ -48,6 +48,19 @@ def generator_objective(
     return jnp.mean(progress + beta * (value - delta))
 
 
+def lsgan_discriminator_loss(
+    label: Float[Array, "B"], score: Float[Array, "B"], generated_score: Float[Array, "n"]
+) -> Float[Array, ""]:
+    """Least-squares GAN on labelled samples (Held et al. 2018, Eq. 4): 1 is wanted of those with label 1, -1 of all others."""
+    errors = jnp.concatenate([2.0 * label - 1.0 - score, -1.0 - generated_score])
+    return jnp.mean(errors**2)
+
+
+def lsgan_generator_loss(generated_score: Float[Array, "n"], *, wanted: float = 1.0) -> Float[Array, ""]:
+    """Pulls generated samples to the score `wanted`: 1 in public implementations of GoalGAN, 0 in its paper."""
+    return jnp.mean((generated_score - wanted) ** 2)
+
+
 def adapt_beta(
     beta: Float[Array, ""],
     episode_return: Float[Array, ""],

@@ -20,7 +20,8 @@ from apt_jax.specs import Obs, Params, Spec, obs_struct, param_struct, zeros_lik
 class Transition(NamedTuple):
     """One environment step.  `next_obs` is the true observation after it, also where an episode ended.
 
-    `done` is terminated or truncated: the next column belongs to another episode.
+    `done` is terminated or truncated: the next column belongs to another episode.  `note` is what the intrinsic reward keeps of
+    the step (`apt_jax.bonuses`), by default nothing.
     """
 
     obs: Obs
@@ -29,13 +30,14 @@ class Transition(NamedTuple):
     next_obs: Obs
     terminated: Bool[Array, "..."]
     done: Bool[Array, "..."]
+    note: Any = ()
 
 
 class Batch(NamedTuple):
     """Transitions over n steps to learn from, leaves [..., B, ...].
 
     `reward` is the discounted sum of the rewards on the way; `discount` multiplies the value of `next_obs`: gamma to the number
-    of steps made, 0 after a termination.
+    of steps made, 0 after a termination.  `note` is that of the first step.
     """
 
     obs: Obs
@@ -43,6 +45,7 @@ class Batch(NamedTuple):
     reward: Float[Array, "..."]
     next_obs: Obs
     discount: Float[Array, "..."]
+    note: Any = ()
 
 
 class Episode(NamedTuple):
@@ -56,6 +59,30 @@ class Episode(NamedTuple):
     success: Bool[Array, "..."]
 
 
+class ReturnRange(NamedTuple):
+    """Smallest and largest undiscounted return of the episodes finished so far, +inf and -inf before the first."""
+
+    low: Float[Array, ""]
+    high: Float[Array, ""]
+
+    @classmethod
+    def empty(cls) -> ReturnRange:
+        """The range of no episode."""
+        return cls(jnp.float32(jnp.inf), jnp.float32(-jnp.inf))
+
+    def extend(self, episode_return: Float[Array, "S E"], done: Bool[Array, "S E"]) -> ReturnRange:
+        """With the returns that `done` marks."""
+        return ReturnRange(
+            jnp.minimum(self.low, jnp.min(episode_return, initial=jnp.inf, where=done)),
+            jnp.maximum(self.high, jnp.max(episode_return, initial=-jnp.inf, where=done)),
+        )
+
+    def bounds(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Both ends; unbounded before the first finished episode."""
+        none = self.low > self.high
+        return jnp.where(none, -jnp.inf, self.low), jnp.where(none, jnp.inf, self.high)
+
+
 class Replay(NamedTuple):
     """Both rings of every source and the range of episodic returns seen so far.
 
@@ -63,15 +90,13 @@ class Replay(NamedTuple):
       transitions: leaves [S, E, T, ...]; column `i % T` holds iteration i.
       episodes: leaves [S, N, ...]; slot `i % N` holds the i-th finished episode of the source.
       finished: episodes finished so far, [S].
-      return_low: smallest undiscounted return of a finished episode of any source, +inf before the first.
-      return_high: largest such return, -inf before the first.
+      returns: range of the returns of all sources.
     """
 
     transitions: Transition
     episodes: Episode
     finished: Int[Array, "S"]
-    return_low: Float[Array, ""]
-    return_high: Float[Array, ""]
+    returns: ReturnRange
 
 
 class Rollouts(NamedTuple):
@@ -84,8 +109,8 @@ class Rollouts(NamedTuple):
     episode_return: Float[Array, "B"]
 
 
-def init(obs_spec: Spec, param_spec: Spec, *, sources: int, envs: int, columns: int, episodes: int) -> Replay:
-    """An empty replay."""
+def init(obs_spec: Spec, param_spec: Spec, *, sources: int, envs: int, columns: int, episodes: int, note: Any = ()) -> Replay:
+    """An empty replay; `note` is the structure (`ShapeDtypeStruct`s) of one step's note."""
     obs = zeros_like(obs_struct(obs_spec), (sources, envs, columns))
     step = (sources, envs, columns)
     slot = (sources, episodes)
@@ -97,6 +122,7 @@ def init(obs_spec: Spec, param_spec: Spec, *, sources: int, envs: int, columns: 
             next_obs=jax.tree.map(jnp.copy, obs),
             terminated=jnp.zeros(step, bool),
             done=jnp.zeros(step, bool),
+            note=zeros_like(note, step),
         ),
         episodes=Episode(
             w=zeros_like(param_struct(param_spec), slot),
@@ -107,8 +133,7 @@ def init(obs_spec: Spec, param_spec: Spec, *, sources: int, envs: int, columns: 
             success=jnp.zeros(slot, bool),
         ),
         finished=jnp.zeros(sources, jnp.int32),
-        return_low=jnp.float32(jnp.inf),
-        return_high=jnp.float32(-jnp.inf),
+        returns=ReturnRange.empty(),
     )
 
 
@@ -127,20 +152,12 @@ def write(
     order = jnp.cumsum(done, axis=1, dtype=jnp.int32) - 1
     slot = jnp.where(done, (replay.finished[:, None] + order) % slots, slots)
     source = jnp.arange(done.shape[0], dtype=jnp.int32)[:, None]
-    returns = episode.episode_return
     return Replay(
         transitions=jax.tree.map(put_column, replay.transitions, transition),
         episodes=jax.tree.map(lambda ring, value: ring.at[source, slot].set(value, mode="drop"), replay.episodes, episode),
         finished=replay.finished + jnp.sum(done, axis=1, dtype=jnp.int32),
-        return_low=jnp.minimum(replay.return_low, jnp.min(returns, initial=jnp.inf, where=done)),
-        return_high=jnp.maximum(replay.return_high, jnp.max(returns, initial=-jnp.inf, where=done)),
+        returns=replay.returns.extend(episode.episode_return, done),
     )
-
-
-def return_range(replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Smallest and largest episodic return seen in any source; unbounded before the first finished episode."""
-    none = replay.return_low > replay.return_high
-    return jnp.where(none, -jnp.inf, replay.return_low), jnp.where(none, jnp.inf, replay.return_high)
 
 
 def sample_transitions(
@@ -197,6 +214,7 @@ def sample_transitions(
         reward=reward,
         next_obs=jax.tree.map(lambda ring: gather(ring, last), rings.next_obs),
         discount=jnp.where(gather(rings.terminated, last), 0.0, discount),
+        note=jax.tree.map(lambda ring: gather(ring, first), rings.note),
     )
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1).reshape(batches, sources * share, *x.shape[3:]), batch)
 
@@ -262,6 +280,17 @@ def sample_rollouts(
         length=picked.length,
         episode_return=picked.episode_return,
     )
+
+
+def latest_episodes(replay: Replay, *, source: int, count: int) -> tuple[Episode, Int[Array, "n"]]:
+    """A source's latest episodes, newest first, and how many were finished before each: negative where there is none.
+
+    At most `count`, and no more than the replay holds.
+    """
+    slots = replay.episodes.env.shape[1]
+    back = jnp.arange(min(count, slots), dtype=jnp.int32)
+    earlier = replay.finished[source] - 1 - back
+    return jax.tree.map(lambda ring: ring[source, earlier % slots], replay.episodes), earlier
 
 
 def recent_outcome(replay: Replay, *, source: int, window: int, since: int = 0) -> dict[str, Any]:

@@ -12,7 +12,8 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, Float
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,45 @@ def param_struct(spec: Spec) -> dict[str, jax.ShapeDtypeStruct]:
                 return jax.ShapeDtypeStruct((modality.height, modality.width, modality.categories), jnp.float32)
 
     return {name: struct(modality) for name, modality in spec.items()}
+
+
+def flatten(spec: Spec, w: Params) -> Float[Array, "*batch D"]:
+    """A task parameter as one vector, block after block: vectors as shares of their range, so in [0, 1], scores as they are."""
+
+    def block(name: str, modality: Modality) -> Array:
+        match modality:
+            case Vector():
+                return (w[name] - modality.low) / (modality.high - modality.low)
+            case Grid():
+                return w[name].reshape(*w[name].shape[:-3], -1)
+
+    return jnp.concatenate([block(name, modality) for name, modality in spec.items()], axis=-1)
+
+
+def unflatten(spec: Spec, vector: Float[Array, "*batch D"]) -> Params:
+    """The task parameter of any vector, brought into range without a change of its categories.
+
+    Vectors are clipped.  Scores clipped one by one would tie above 1, and a tie goes to the first category; so the scores of a
+    cell that leave [0, 1] are moved and shrunk together, which keeps their order.
+    """
+    struct = param_struct(spec)
+    ends = np.cumsum([block.size for block in struct.values()])
+    w = {}
+    for (name, modality), block in zip(spec.items(), jnp.split(vector, ends[:-1], axis=-1), strict=True):
+        match modality:
+            case Vector():
+                w[name] = modality.low + (modality.high - modality.low) * jnp.clip(block, 0.0, 1.0)
+            case Grid():
+                scores = block.reshape(*block.shape[:-1], *struct[name].shape)
+                scores = scores - jnp.minimum(jnp.min(scores, axis=-1, keepdims=True), 0.0)
+                w[name] = scores / jnp.maximum(jnp.max(scores, axis=-1, keepdims=True), 1.0)
+    return w
+
+
+def block_weights(spec: Spec) -> Float[np.ndarray, "D"]:
+    """Factors on flattened parameters by which every block, however many numbers it has, weighs the same in a distance."""
+    sizes = [struct.size for struct in param_struct(spec).values()]
+    return np.concatenate([np.full(size, size**-0.5, np.float32) for size in sizes])
 
 
 def zeros_like(struct: Any, leading: tuple[int, ...] = ()) -> Any:

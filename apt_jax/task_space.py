@@ -53,6 +53,10 @@ class TaskSpace(Protocol):
         """One step with an action in [0, num_actions)."""
         ...
 
+    def fingerprint(self, state: Any) -> Int[Array, "k"]:
+        """Whole numbers by which visits of a state within an episode are told apart; continuous parts are rounded."""
+        ...
+
     def describe(self, task: Any, target: Any) -> dict[str, Float[Array, ""]]:
         """Scalars worth watching as a curriculum unfolds, of a task alone or beside the target; the space chooses their names.
 

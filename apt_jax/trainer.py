@@ -1,7 +1,7 @@
 """One seed of training as pure functions: `chunk` is a scan of iterations followed by an evaluation.
 
     act -> step -> write -> learn -> adapt        every iteration
-    refresh the curriculum (beta)                 every `Config.refresh_every` environment steps
+    refresh the curriculum (beta, mixtures)       every `Config.refresh_every` environment steps
     evaluate, keep or restore the policy          every `Config.eval_every` environment steps: the end of a chunk
 
 The caller batches over seeds and hyper-parameters and jits (`apt_jax.lanes`).  The clock is never batched.
@@ -18,12 +18,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import evaluation, learner, replay, workers
+from apt_jax.bonuses.base import Step
+from apt_jax.bonuses.none import no_update as no_bonus_update
 from apt_jax.config import Config, HParams
-from apt_jax.curricula import make_curriculum
 from apt_jax.curricula.base import GENERATED, TARGET, Metrics, no_update
+from apt_jax.methods import make_method
 from apt_jax.networks import QNetwork
 from apt_jax.specs import Grid, Obs, Params, Spec, Vector, param_struct
 from apt_jax.task_space import TaskSpace
+
+_REFRESH_STREAM = 1_000_033
+"""Refreshing draws from a stream of its own, so that curricula which draw nothing there change nothing elsewhere."""
 
 
 class Clock(NamedTuple):
@@ -47,6 +52,7 @@ class TrainState(NamedTuple):
     learner: learner.LearnerState
     kept: learner.Kept
     curriculum: Any
+    bonus: Any
     replay: replay.Replay
     workers: workers.Workers
 
@@ -83,9 +89,9 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
     """
     check_counts(config)
     check_target(space, target)
-    curriculum = make_curriculum(space, config)
+    curriculum, bonus = make_method(space, config)
     sources = 2 if curriculum.generates else 1
-    learns = curriculum.update is not no_update
+    learns = curriculum.update is not no_update or bonus.update is not no_bonus_update
     check_sizes(config, sources, space.horizon, learns)
     network = QNetwork(space.obs_spec, space.num_actions)
     envs = config.envs_per_source
@@ -96,9 +102,10 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         return workers.assign(space, target, w, envs)
 
     def init(key: Key[Array, ""], hparams: HParams) -> TrainState:
-        key, key_eval, key_learner, key_curriculum, key_assign, key_start = jax.random.split(key, 6)
+        key, key_eval, key_learner, key_curriculum, key_assign, key_start, key_bonus = jax.random.split(key, 7)
         learner_state = learner.init(network, key_learner)
         curriculum_state = curriculum.init(key_curriculum, hparams)
+        environments = workers.start(space, assign(target, curriculum_state, key_assign, hparams), key_start)
         return TrainState(
             target=jax.tree.map(jnp.asarray, target),
             key=key,
@@ -106,6 +113,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             learner=learner_state,
             kept=learner.Kept(jax.tree.map(jnp.copy, learner_state), jnp.float32(jnp.nan)),
             curriculum=curriculum_state,
+            bonus=bonus.init(key_bonus, environments.state, hparams),
             replay=replay.init(
                 space.obs_spec,
                 space.param_spec,
@@ -113,8 +121,9 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
                 envs=envs,
                 columns=config.replay_steps // envs,
                 episodes=config.replay_episodes,
+                note=bonus.note,
             ),
-            workers=workers.start(space, assign(target, curriculum_state, key_assign, hparams), key_start),
+            workers=environments,
         )
 
     def collect(
@@ -124,8 +133,12 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         key_act, key_assign, key_step = jax.random.split(key, 3)
         action = learner.epsilon_greedy(network, state.learner.params, state.workers.obs, key_act, epsilon)
         assignment = assign(state.target, state.curriculum, key_assign, hparams)
-        after, transition, episode, done = workers.step(space, state.workers, action, assignment, clock.iteration, key_step)
-        return state._replace(workers=after, replay=replay.write(state.replay, clock.iteration, transition, episode, done))
+        after, transition, true_state, episode, done = workers.step(
+            space, state.workers, action, assignment, clock.iteration, key_step, rollouts=curriculum.rollouts
+        )
+        bonus_state, note = bonus.annotate(state.bonus, Step(transition, true_state, after.state), hparams)
+        rings = replay.write(state.replay, clock.iteration, transition._replace(note=note), episode, done)
+        return state._replace(workers=after, bonus=bonus_state, replay=rings)
 
     def tick(clock: Clock) -> Clock:
         return Clock(clock.iteration + 1, clock.env_steps + steps)
@@ -142,24 +155,28 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             horizon=space.horizon,
             gamma=hparams.gamma,
         )
-        low, high = replay.return_range(state.replay)
+        reward, bonus_metrics = bonus.reward(state.bonus, batches, hparams)
+        low, high = bonus.return_range(state.bonus, state.replay)
 
         def update(carry: learner.LearnerState, batch: replay.Batch) -> tuple[learner.LearnerState, Metrics]:
             return learner.update(network, carry, batch, low=low, high=high, hparams=hparams)
 
-        learner_state, metrics = jax.lax.scan(update, state.learner, batches)
-        return state._replace(learner=learner_state), _mean(metrics)
+        learner_state, metrics = jax.lax.scan(update, state.learner, batches._replace(reward=reward))
+        return state._replace(learner=learner_state), {**_mean(metrics), **bonus_metrics}
 
     def adapt(state: TrainState, clock: Clock, key: Key[Array, ""], hparams: HParams) -> tuple[TrainState, Metrics]:
-        def update(carry: tuple[Any, Key[Array, ""]], _: None) -> tuple[tuple[Any, Key[Array, ""]], Metrics]:
-            curriculum_state, key = carry
-            key, key_update = jax.random.split(key)
-            curriculum_state, metrics = curriculum.update(curriculum_state, key_update, state.replay, clock.iteration, hparams)
-            return (curriculum_state, key), metrics
+        def update(carry: tuple[Any, Any, Key[Array, ""]], _: None) -> tuple[tuple[Any, Any, Key[Array, ""]], Metrics]:
+            curriculum_state, bonus_state, key = carry
+            key, key_curriculum, key_bonus = jax.random.split(key, 3)
+            curriculum_state, metrics = curriculum.update(
+                curriculum_state, key_curriculum, state.replay, clock.iteration, hparams
+            )
+            bonus_state, bonus_metrics = bonus.update(bonus_state, key_bonus, state.replay, clock.iteration, hparams)
+            return (curriculum_state, bonus_state, key), {**metrics, **bonus_metrics}
 
         rounds = round(config.model_updates_per_step * steps) if learns else 0
-        (curriculum_state, _), metrics = jax.lax.scan(update, (state.curriculum, key), length=rounds)
-        return state._replace(curriculum=curriculum_state), _mean(metrics)
+        (curriculum_state, bonus_state, _), metrics = jax.lax.scan(update, (state.curriculum, state.bonus, key), length=rounds)
+        return state._replace(curriculum=curriculum_state, bonus=bonus_state), _mean(metrics)
 
     def iteration(carry: tuple[TrainState, Clock], hparams: HParams) -> tuple[tuple[TrainState, Clock], Metrics]:
         state, clock = carry
@@ -225,7 +242,8 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             (state, clock), metrics = jax.lax.scan(
                 lambda c, _: iteration(c, hparams), carry, length=config.refresh_every // steps
             )
-            refreshed = curriculum.refresh(state.curriculum, state.replay, hparams)
+            key_refresh = jax.random.fold_in(state.key, _REFRESH_STREAM)
+            refreshed = curriculum.refresh(state.curriculum, key_refresh, state.replay, clock.iteration, hparams)
             return (state._replace(curriculum=refreshed), clock), _mean(metrics)
 
         (state, clock), metrics = jax.lax.scan(refresh_period, (state, clock), length=config.eval_every // config.refresh_every)
@@ -256,6 +274,11 @@ def check_counts(config: Config) -> None:
         "rollout_steps",
         "recent_steps",
         "value_ensemble",
+        "alp_window",
+        "alp_history",
+        "goal_rollouts",
+        "goal_tasks",
+        "goal_memory",
         "noise_size",
         "return_window",
         "eval_episodes",

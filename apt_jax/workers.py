@@ -16,13 +16,15 @@ from apt_jax.task_space import TaskSpace
 class Workers(NamedTuple):
     """Environments in the middle of their episodes; leaves [S, E, ...].
 
-    `w` is the parameter of the current task (zeros for the target), `length` and `episode_return` count the current episode.
+    `w` is the parameter of the current task (zeros for the target), `played` counts the episodes finished on it; `length` and
+    `episode_return` are those of the current episode.
     """
 
     state: Any
     obs: Obs
     task: Any
     w: Params
+    played: Int[Array, "S E"]
     length: Int[Array, "S E"]
     episode_return: Float[Array, "S E"]
 
@@ -49,7 +51,8 @@ def start(space: TaskSpace, assignment: Assignment, key: Key[Array, ""]) -> Work
     """All environments at the beginning of an episode; consumes `key`."""
     shape = jax.tree.leaves(assignment.w)[0].shape[:2]
     state, obs = _grid(space.reset)(jax.random.split(key, shape), assignment.task)
-    return Workers(state, obs, assignment.task, assignment.w, jnp.zeros(shape, jnp.int32), jnp.zeros(shape))
+    none = jnp.zeros(shape, jnp.int32)
+    return Workers(state, obs, assignment.task, assignment.w, none, none, jnp.zeros(shape))
 
 
 def step(
@@ -59,12 +62,17 @@ def step(
     assignment: Assignment,
     iteration: Int[Array, ""],
     key: Key[Array, ""],
-) -> tuple[Workers, Transition, Episode, Bool[Array, "S E"]]:
+    *,
+    rollouts: int = 1,
+) -> tuple[Workers, Transition, Any, Episode, Bool[Array, "S E"]]:
     """Step every environment; where its episode ends, reset it into its assigned task; consumes `key`.
 
+    Args:
+      rollouts: episodes that a task is played for before an assignment replaces it.
+
     Returns:
-      The workers after the reset, the transitions with their true final observations, the episodes as they would end with this
-      step, and which of them did.
+      The workers after the reset, the transitions with their true final observations, the true final states, the episodes as
+      they would end with this step, and which of them did.
     """
     out = _grid(space.step)(workers.state, action, workers.task)
     done = out.terminated | out.truncated
@@ -75,13 +83,24 @@ def step(
     end = jnp.broadcast_to(iteration, done.shape)
     episode = Episode(workers.w, env, end, length, episode_return, out.success)
 
-    going_on = Workers(out.state, out.obs, workers.task, workers.w, length, episode_return)
-    fresh = start(space, assignment, key)
+    going_on = Workers(out.state, out.obs, workers.task, workers.w, workers.played, length, episode_return)
+    if rollouts == 1:
+        fresh = start(space, assignment, key)
+    else:
+        played = workers.played + 1
+        again = played < rollouts
+        assignment = _where(again, Assignment(workers.task, workers.w), assignment)
+        fresh = start(space, assignment, key)._replace(played=jnp.where(again, played, 0))
+    return _where(done, fresh, going_on), transition, out.state, episode, done
+
+
+def _where(condition: Bool[Array, "S E"], new: Any, old: Any) -> Any:
+    """Leaves [S, E, ...] of either tree."""
 
     def select(new: Array, old: Array) -> Array:
-        return jnp.where(done.reshape(*done.shape, *(1,) * (new.ndim - 2)), new, old)
+        return jnp.where(condition.reshape(*condition.shape, *(1,) * (new.ndim - 2)), new, old)
 
-    return jax.tree.map(select, fresh, going_on), transition, episode, done
+    return jax.tree.map(select, new, old)
 
 
 def _grid(function: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +16,11 @@ from rich.table import Table
 
 import envs.rendering
 from apt_jax.evaluation import Outcome
-from apt_jax.lanes import stack_hparams
 from experiments import episodes, runtime, settings
 from experiments.errors import UsageError, exit_with
 from experiments.problem import make_problem
 from experiments.run_dir import RunDir
-from experiments.runner import lane_keys, load_states
+from experiments.runner import lane_inputs, load_states
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Args:
       run_dir: a directory that experiments.train wrote.
       target: a target's name, by default the one trained on.
       target_file: a file that describes the target task, instead of a name.
-      episodes: greedy episodes per seed.
+      episodes: greedy episodes per lane.
       seed: of the episodes' initial states.
-      gif: where to put a film of the best seed.
+      gif: where to put a film of the best lane.
     """
 
     run_dir: Path
@@ -53,30 +53,35 @@ def main() -> int:
 
 
 def evaluate(args: Args) -> None:
-    """Prints return and success of every seed."""
+    """Prints return and success of every lane."""
     if args.episodes < 1:
         raise UsageError(f"--episodes must be at least 1, got {args.episodes}")
     experiment = settings.load(args.run_dir)
     if args.target or args.target_file:
         experiment = dataclasses.replace(experiment, target=args.target or experiment.target, target_file=args.target_file)
     problem = make_problem(experiment)
-    keys, hparams = lane_keys(experiment.seeds), stack_hparams([experiment.hparams] * len(experiment.seeds))
+    keys, hparams = lane_inputs(experiment)
     here = SingleDeviceSharding(jax.devices()[0])
     states, clock = load_states(RunDir(args.run_dir).checkpoints, problem.trainer, keys, hparams, here)
     policies = states.learner.params
     key_score, key_film = jax.random.split(jax.random.key(args.seed))
     outcome = episodes.score(problem.trainer, policies, problem.target, episodes=args.episodes, key=key_score)
-    _print(experiment.seeds, outcome, f"{settings.target_name(experiment)} after {int(clock.env_steps):,} steps")
+    names = [lane.name for lane in experiment.lanes]
+    _print(
+        names,
+        outcome,
+        f"{settings.target_name(experiment)} after {int(clock.env_steps):,} steps",
+    )
     if args.gif:
         best = int(np.argmax(outcome.episode_return.mean(axis=1)))
         policy = jax.tree.map(lambda x: x[best], policies)
         envs.rendering.save_gif(args.gif, episodes.film(problem.space, problem.trainer, policy, problem.target, key_film))
 
 
-def _print(seeds: tuple[int, ...], outcome: Outcome, title: str) -> None:
-    table = Table("seed", "return", "success", "steps", title=title)
-    for seed, *values in zip(seeds, outcome.episode_return, outcome.success, outcome.length, strict=True):
-        table.add_row(str(seed), *(f"{np.mean(value):.3f}" for value in values))
+def _print(lanes: Sequence[str], outcome: Outcome, title: str) -> None:
+    table = Table("", "return", "success", "steps", title=title)
+    for lane, *values in zip(lanes, outcome.episode_return, outcome.success, outcome.length, strict=True):
+        table.add_row(lane, *(f"{np.mean(value):.3f}" for value in values))
     table.add_section()
     table.add_row("mean", *(f"{np.mean(values):.3f}" for values in outcome))
     Console().print(table)

@@ -15,14 +15,14 @@ from experiments.problem import Problem
 from experiments.settings import Experiment, target_name
 
 _COLUMNS, _ROWS = 6, 5
-"""Steps and seeds in the picture of the progression, at most."""
+"""Steps and lanes in the picture of the progression, at most."""
 
 _SAMPLES, _SMALL = 30, 8
 """Steps, at most, and pixels per tile where all sampled tasks are shown together."""
 
 
 def draw(path: Path, experiment: Experiment, problem: Problem, policies: Any) -> None:
-    """Learning curves, progression of generated tasks, and the best seed's policy (leaves [L, ...]) on the target."""
+    """Learning curves, progression of generated tasks, and the best lane's policy (leaves [L, ...]) on the target."""
     draw_curves(path, experiment)
     if run_dir.task_files(path):
         draw_progression(path, experiment, problem)
@@ -32,22 +32,20 @@ def draw(path: Path, experiment: Experiment, problem: Problem, policies: Any) ->
 
 def draw_curves(path: Path, experiment: Experiment) -> None:
     """learning_curves.png."""
-    env_steps, curves = run_dir.read_metrics(path)
+    delta = experiment.hparams.delta
     plots.learning_curves(
         path / "learning_curves.png",
-        env_steps,
-        curves,
-        seeds=experiment.seeds,
-        delta=float(experiment.hparams.delta),
+        run_dir.read_settings(path),
+        delta=None if isinstance(delta, tuple) else delta,
         title=f"{experiment.config.method} on {experiment.space}, target {target_name(experiment)}",
     )
 
 
 def draw_progression(path: Path, experiment: Experiment, problem: Problem) -> None:
-    """progression.png: the first sampled task of each seed over time."""
+    """progression.png: the first sampled task of each lane over time."""
     files = run_dir.task_files(path)
     instantiate = jax.jit(problem.space.instantiate)
-    lanes = range(min(_ROWS, len(experiment.seeds)))
+    lanes = range(min(_ROWS, len(experiment.lanes)))
     boards = {}
     for step in plots.evenly(list(files), at_most=_COLUMNS):
         with np.load(files[step]) as w:
@@ -56,12 +54,12 @@ def draw_progression(path: Path, experiment: Experiment, problem: Problem) -> No
         path / "progression.png",
         boards,
         problem.space.render(problem.target),
-        rows=[f"seed {experiment.seeds[lane]}" for lane in lanes],
+        rows=[experiment.lanes[lane].name for lane in lanes],
     )
 
 
 def draw_tasks(path: Path, experiment: Experiment, problem: Problem) -> None:
-    """tasks/seed_*.png: the sampled tasks of each seed over time."""
+    """tasks/*.png: the sampled tasks of each lane over time."""
     instantiate = jax.jit(problem.space.instantiate)
     samples = {}
     files = run_dir.task_files(path)
@@ -72,18 +70,18 @@ def draw_tasks(path: Path, experiment: Experiment, problem: Problem) -> None:
     def picture(w: Params) -> plots.Image:
         return problem.space.render(instantiate(w), tile_size=_SMALL)
 
-    for lane, seed in enumerate(experiment.seeds):
+    for i, lane in enumerate(experiment.lanes):
         boards = {
-            step: [picture({name: w[name][lane, i] for name in w}) for i in range(next(iter(w.values())).shape[1])]
+            step: [picture({name: w[name][i, task] for name in w}) for task in range(next(iter(w.values())).shape[1])]
             for step, w in samples.items()
         }
-        plots.mosaic(path / "tasks" / f"seed_{seed}.png", boards, title=f"generated tasks, seed {seed}")
+        plots.mosaic(path / "tasks" / f"{lane.slug}.png", boards, title=f"generated tasks, {lane.name}")
 
 
 def draw_policy(path: Path, experiment: Experiment, problem: Problem, policies: Any) -> None:
-    """policy.gif: the seed with the best final return on the target."""
+    """policy.gif: the lane with the best final return on the target."""
     _, curves = run_dir.read_metrics(path)
     best = int(np.argmax(curves["target_return"][:, -1]))
     policy = jax.tree.map(lambda x: x[best], policies)
-    frames = episodes.film(problem.space, problem.trainer, policy, problem.target, jax.random.key(experiment.seeds[best]))
+    frames = episodes.film(problem.space, problem.trainer, policy, problem.target, jax.random.key(experiment.lanes[best].seed))
     envs.rendering.save_gif(path / "policy.gif", frames)

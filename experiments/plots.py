@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -13,6 +14,8 @@ from matplotlib.figure import Figure
 from experiments.run_dir import Curves
 
 Image = UInt8[np.ndarray, "H W 3"]
+Run = tuple[Int[np.ndarray, "T"], Curves]
+"""Environment steps of the evaluations, and the metrics then."""
 
 PANELS = {
     "target_return": "Return on the target",
@@ -27,19 +30,27 @@ _MEAN_COLOUR = "black"
 _TARGET_COLOUR = "tab:green"
 
 
-def learning_curves(
-    file: Path, env_steps: Int[np.ndarray, "T"], curves: Curves, *, seeds: Sequence[int], delta: float, title: str
-) -> None:
-    """One panel per metric: every seed thin, their mean thick; `delta` is the generated return that beta steers to."""
+def learning_curves(file: Path, settings: Mapping[str, Run], *, delta: float | None, title: str) -> None:
+    """One panel per metric: every seed thin, their mean thick, in a colour per setting of swept hyper-parameters.
+
+    Args:
+      settings: by name, which is "" if nothing is swept.
+      delta: the generated return that beta steers to, None if that differs.
+    """
+    single = len(settings) == 1
+    curves = next(iter(settings.values()))[1]
     names = [name for name in PANELS if name in curves]
     figure = Figure(figsize=(4.2 * len(names), 3.6), layout="constrained")
     for axes, name in zip(np.atleast_1d(figure.subplots(1, len(names))), names, strict=True):
-        for seed, values in zip(seeds, curves[name], strict=True):
-            axes.plot(env_steps, values, marker=".", markersize=3, linewidth=1, alpha=0.6, label=f"seed {seed}")
-        mean = np.ma.masked_invalid(curves[name]).mean(axis=0)
-        axes.plot(env_steps, mean, color=_MEAN_COLOUR, linewidth=2, label="mean")
+        for index, (setting, (env_steps, curves)) in enumerate(settings.items()):
+            for seed, values in zip(curves["seed"][:, 0], curves[name], strict=True):
+                style: dict[str, Any] = {"label": f"seed {seed:g}"} if single else {"color": f"C{index}"}
+                axes.plot(env_steps, values, marker=".", markersize=3, linewidth=1, alpha=0.6 if single else 0.25, **style)
+            mean = np.ma.masked_invalid(curves[name]).mean(axis=0)
+            colour = _MEAN_COLOUR if single else f"C{index}"
+            axes.plot(env_steps, mean, color=colour, linewidth=2, label="mean" if single else setting)
         _decorate(axes, name)
-        if name == "generated_episode_return" and "beta" in curves:
+        if name == "generated_episode_return" and "beta" in curves and delta is not None:
             _mark(axes, delta, "delta")
     handles = figure.axes[0].get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=min(3 * len(names), 8), fontsize="small")
@@ -47,19 +58,25 @@ def learning_curves(
     figure.savefig(file, dpi=150)
 
 
-def comparison(file: Path, runs: Mapping[str, tuple[Int[np.ndarray, "T"], Curves]]) -> None:
-    """The target return of several runs: every seed thin, the mean over seeds thick, a standard deviation shaded."""
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.subplots()
-    for index, (name, (env_steps, curves)) in enumerate(runs.items()):
-        colour = f"C{index}"
-        mean, deviation = curves["target_return"].mean(axis=0), curves["target_return"].std(axis=0)
-        axes.fill_between(env_steps, mean - deviation, mean + deviation, color=colour, alpha=0.1, linewidth=0)
-        for values in curves["target_return"]:
-            axes.plot(env_steps, values, color=colour, linewidth=0.8, alpha=0.4)
-        axes.plot(env_steps, mean, color=colour, linewidth=2.5, label=name)
-    _decorate(axes, "target_return")
-    axes.legend()
+def comparison(file: Path, panels: Mapping[str, Mapping[str, Run]]) -> None:
+    """The target return of several runs, by panel and name: every seed thin, their mean thick, a standard deviation shaded.
+
+    A name has the same colour in every panel.
+    """
+    names = list(dict.fromkeys(name for runs in panels.values() for name in runs))
+    figure = Figure(figsize=(7 if len(panels) == 1 else 5 * len(panels), 4), layout="constrained")
+    for axes, (title, runs) in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels.items(), strict=True):
+        for name, (env_steps, curves) in runs.items():
+            colour = f"C{names.index(name)}"
+            mean, deviation = curves["target_return"].mean(axis=0), curves["target_return"].std(axis=0)
+            axes.fill_between(env_steps, mean - deviation, mean + deviation, color=colour, alpha=0.1, linewidth=0)
+            for values in curves["target_return"]:
+                axes.plot(env_steps, values, color=colour, linewidth=0.8, alpha=0.4)
+            axes.plot(env_steps, mean, color=colour, linewidth=2.5, label=name)
+        _decorate(axes, "target_return")
+        if title:
+            axes.set_title(title, fontsize="medium")
+        axes.legend(fontsize="small")
     figure.savefig(file, dpi=150)
 
 

@@ -62,10 +62,10 @@ class Pace:
 
 
 class LiveView:
-    """A bar and a table of seeds that redraw in place."""
+    """A bar and a table of lanes that redraw in place."""
 
-    def __init__(self, seeds: Sequence[int], total: int, console: Console):
-        self._seeds, self._total = seeds, total
+    def __init__(self, lanes: Sequence[str], total: int, console: Console):
+        self._lanes, self._total = lanes, total
         self._bar = Progress(TextColumn("steps"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[pace]}"))
         self._task = self._bar.add_task("steps", total=total, pace="preparing")
         self._pace = Pace(0, total)
@@ -90,7 +90,7 @@ class LiveView:
     def write(self, env_steps: int, metrics: Metrics) -> None:
         """Redraws bar and table."""
         self._bar.update(self._task, completed=env_steps, pace=self._pace.describe(env_steps))
-        self._live.update(Group(self._bar, _table(self._seeds, metrics)))
+        self._live.update(Group(self._bar, _table(self._lanes, metrics)))
 
     def stop(self) -> None:
         """Leaves the last state on the terminal."""
@@ -118,7 +118,7 @@ class PlainView:
         self._pace = Pace(env_steps, self._total)
 
     def write(self, env_steps: int, metrics: Metrics) -> None:
-        """Steps, pace and the mean over seeds of each shown metric."""
+        """Steps, pace and the mean over lanes of each shown metric."""
         values = [f"{title} {metrics[name].mean():.3f}" for name, title in COLUMNS.items() if name in metrics]
         self.note(f"{env_steps:,}/{self._total:,} steps, {self._pace.describe(env_steps)} | " + ", ".join(values))
 
@@ -126,19 +126,19 @@ class PlainView:
         """Nothing to stop."""
 
 
-def make_view(seeds: Sequence[int], total: int) -> View:
+def make_view(lanes: Sequence[str], total: int) -> View:
     """Live on a terminal, plain elsewhere."""
     console = Console()
-    return LiveView(seeds, total, console) if console.is_terminal else PlainView(total)
+    return LiveView(lanes, total, console) if console.is_terminal else PlainView(total)
 
 
-def _table(seeds: Sequence[int], metrics: Metrics) -> Table:
+def _table(lanes: Sequence[str], metrics: Metrics) -> Table:
     names = [name for name in COLUMNS if name in metrics]
-    table = Table("seed", *(COLUMNS[name] for name in names))
+    table = Table("", *(COLUMNS[name] for name in names))
     for column in table.columns:
         column.justify = "right"
-    for lane, seed in enumerate(seeds):
-        table.add_row(str(seed), *(f"{metrics[name][lane]:.3f}" for name in names))
+    for i, lane in enumerate(lanes):
+        table.add_row(lane, *(f"{metrics[name][i]:.3f}" for name in names))
     table.add_section()
     table.add_row("mean", *(f"{metrics[name].mean():.3f}" for name in names))
     return table

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,10 +11,20 @@ import tyro
 from jaxtyping import Float, Int
 
 from experiments import plots, run_dir
+from experiments.aggregates import iqm, iqm_interval
 from experiments.errors import exit_with
 
 SOLVED = 0.9
 """Target return from which a task counts as solved."""
+
+HEADER = (
+    "run",
+    "steps",
+    "final return by seed (mean ± deviation)",
+    "interquartile mean (95 % interval)",
+    "before the restore rule",
+    f"first steps above {SOLVED:g}",
+)
 
 
 @dataclass(frozen=True)
@@ -21,7 +32,7 @@ class Report:
     """Compare runs on the same target.
 
     Attributes:
-      runs: run directories; a run is called by its directory's name.
+      runs: run directories; a run is called by its directory's name, and each combination of swept hyper-parameters is one.
       figure: where to draw the target return of every seed; not drawn by default.
     """
 
@@ -32,25 +43,39 @@ class Report:
 def main() -> int:
     """The command line."""
     report = tyro.cli(Report, prog="python -m experiments.report", description=__doc__)
-    runs = {path.name: run_dir.read_metrics(path) for path in report.runs}
-    print("| run | steps | final return by seed (mean ± deviation) | before the restore rule | first steps above 0.9 |")
-    print("|---|---|---|---|---|")
-    for name, (env_steps, curves) in runs.items():
-        print(row(name, env_steps, curves))
+    runs = read(report.runs)
+    print(table(runs))
     if report.figure:
         report.figure.parent.mkdir(parents=True, exist_ok=True)
-        plots.comparison(report.figure, runs)
+        plots.comparison(report.figure, {"": runs})
     return 0
+
+
+def read(paths: Sequence[Path]) -> dict[str, plots.Run]:
+    """Metrics of every run and setting, by name; raises a `UsageError` for a directory without any."""
+    return {
+        f"{path.name}, {setting}" if setting else path.name: run
+        for path in paths
+        for setting, run in run_dir.read_settings(path).items()
+    }
+
+
+def table(runs: dict[str, plots.Run]) -> str:
+    """A Markdown table with a line per run."""
+    lines = [f"| {' | '.join(HEADER)} |", "|---" * len(HEADER) + "|"]
+    return "\n".join(lines + [row(name, env_steps, curves) for name, (env_steps, curves) in runs.items()])
 
 
 def row(name: str, env_steps: Int[np.ndarray, "T"], curves: run_dir.Curves) -> str:
     """One line of the table; a dash where a seed never got there."""
     final, raw = curves["target_return"][:, -1], curves["target_return_raw"][:, -1]
     firsts = [first_above(env_steps, values) for values in curves["target_return_raw"]]
+    low, high = iqm_interval(final)
     cells = (
         name,
         f"{env_steps[-1]:,}",
         f"{_numbers(final)} ({final.mean():.2f} ± {final.std():.2f})",
+        f"{iqm(final):.2f} ({low:.2f} to {high:.2f})",
         _numbers(raw),
         " ".join("-" if step is None else f"{step / 1000:g}k" for step in firsts),
     )

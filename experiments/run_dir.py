@@ -1,10 +1,10 @@
 """The files of one run.
 
 * config.json: the experiment, enough to resume it
-* metrics.csv: one row per seed and evaluation
+* metrics.csv: one row per lane and evaluation; the columns before `env_steps` (seed, swept hyper-parameters) name the lane
 * summary.json: results, times, versions
 * checkpoints/: the latest state (orbax)
-* tasks/: generated task parameters over time, one npz per sampled step, leaves [seeds, tasks, ...], and a picture per seed
+* tasks/: generated task parameters over time, one npz per sampled step, leaves [lanes, tasks, ...], and a picture per lane
 * pictures
 """
 
@@ -25,10 +25,8 @@ from jaxtyping import Float, Int
 from apt_jax.specs import Params
 from experiments.errors import UsageError
 
-Curves = dict[str, Float[np.ndarray, "S T"]]
-"""Metrics by name: one row per seed, one column per evaluation."""
-
-_INDEX = ("seed", "env_steps", "wall_seconds")
+Curves = dict[str, Float[np.ndarray, "L T"]]
+"""Metrics by name: one row per lane, one column per evaluation."""
 
 
 class RunDir:
@@ -73,18 +71,22 @@ class RunDir:
                 file.unlink()
 
     def append_metrics(
-        self, env_steps: int, wall_seconds: float, seeds: Sequence[int], metrics: Mapping[str, Float[np.ndarray, "S"]]
+        self,
+        env_steps: int,
+        wall_seconds: float,
+        lanes: Sequence[Mapping[str, float]],
+        metrics: Mapping[str, Float[np.ndarray, "L"]],
     ) -> None:
-        """One row per seed."""
+        """One row per lane, named by the columns in `lanes`."""
         rows = [
-            dict(zip(_INDEX, (seed, env_steps, f"{wall_seconds:.2f}"), strict=True))
-            | {name: str(values[lane]) for name, values in sorted(metrics.items())}
-            for lane, seed in enumerate(seeds)
+            {**lane, "env_steps": env_steps, "wall_seconds": f"{wall_seconds:.2f}"}
+            | {name: str(values[i]) for name, values in sorted(metrics.items())}
+            for i, lane in enumerate(lanes)
         ]
         _write_rows(self.path / "metrics.csv", rows, mode="a")
 
     def write_tasks(self, env_steps: int, w: Params) -> None:
-        """Generated task parameters, leaves [seeds, tasks, ...]."""
+        """Generated task parameters, leaves [lanes, tasks, ...]."""
         (self.path / "tasks").mkdir(exist_ok=True)
         arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in w.items()}
         np.savez_compressed(self.path / "tasks" / f"{env_steps:010d}.npz", **arrays)
@@ -121,18 +123,33 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def read_metrics(path: Path) -> tuple[Int[np.ndarray, "T"], Curves]:
-    """The environment steps of every evaluation that is there for all seeds, and the metrics with `wall_seconds`.
+    """The environment steps of every evaluation that is there for all lanes, and the metrics with the lanes' own columns.
 
     Raises:
       UsageError: no evaluation yet.
     """
     rows = _read_rows(path)
-    seeds = len({row["seed"] for row in rows})
-    rows = rows[: len(rows) - len(rows) % max(seeds, 1)]
+    lanes = len({tuple(row[name] for name in _lane_columns(rows)) for row in rows})
+    rows = rows[: len(rows) - len(rows) % max(lanes, 1)]
     if not rows:
         raise UsageError(f"{path} holds no evaluation yet (no rows in metrics.csv)")
-    columns = {name: np.array([float(row[name]) for row in rows]).reshape(-1, seeds).T for name in rows[0]}
+    columns = {name: np.array([float(row[name]) for row in rows]).reshape(-1, lanes).T for name in rows[0]}
     return columns.pop("env_steps")[0].astype(int), columns
+
+
+def read_settings(path: Path) -> dict[str, tuple[Int[np.ndarray, "T"], Curves]]:
+    """Like `read_metrics`, the lanes of each combination of swept hyper-parameters apart, by its name ("" without a sweep)."""
+    env_steps, curves = read_metrics(path)
+    columns = [name for name in _lane_columns(_read_rows(path)) if name != "seed"]
+    names = [", ".join(f"{name} {curves[name][i, 0]:g}" for name in columns) for i in range(len(curves["seed"]))]
+    lanes = {name: [i for i, other in enumerate(names) if other == name] for name in dict.fromkeys(names)}
+    return {name: (env_steps, {metric: values[own] for metric, values in curves.items()}) for name, own in lanes.items()}
+
+
+def _lane_columns(rows: Sequence[Mapping[str, str]]) -> list[str]:
+    """What names a lane: the columns before `env_steps`."""
+    names = list(rows[0]) if rows else ["env_steps"]
+    return names[: names.index("env_steps")]
 
 
 def wall_seconds(path: Path) -> float:

@@ -1,4 +1,4 @@
-"""All seeds of one experiment on the devices at hand: advance, save, restore."""
+"""All lanes of one experiment on the devices at hand: advance, save, restore."""
 
 from __future__ import annotations
 
@@ -26,14 +26,13 @@ _PROPOSE_STREAM = 1_000_003
 
 
 class Runner:
-    """Holds the states of L lanes, one per seed, and the compiled functions that change them."""
+    """Holds the states of L lanes and the compiled functions that change them."""
 
-    def __init__(self, trainer: Trainer, experiment: Experiment, layout: Layout):
-        self._lanes = len(experiment.seeds)
+    def __init__(self, trainer: Trainer, experiment: Experiment, layout: Layout, at_once: int | None = None):
+        self._lanes = len(experiment.lanes)
         self._trainer = trainer
-        self._program = make_program(trainer, self._lanes, layout=layout)
-        self._hparams = stack_hparams([experiment.hparams] * self._lanes)
-        self._keys = lane_keys(experiment.seeds)
+        self._program = make_program(trainer, self._lanes, layout=layout, at_once=at_once)
+        self._keys, self._hparams = lane_inputs(experiment)
         self._propose = jax.jit(jax.vmap(trainer.propose, in_axes=(0, 0, None, 0)), static_argnums=2)
         self._states: TrainState
         self._clock: Clock
@@ -71,7 +70,7 @@ class Runner:
         return jax.device_get(metrics)
 
     def propose(self, n: int) -> Params:
-        """`n` tasks that each seed's curriculum would generate now, leaves [L, n, ...]."""
+        """`n` tasks that each lane's curriculum would generate now, leaves [L, n, ...]."""
         keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, _PROPOSE_STREAM), self.env_steps))(self._keys)
         rows = self._states.key.shape[0]
         keys, hparams = jax.tree.map(lambda x: _pad(x, rows), (keys, self._hparams))
@@ -100,9 +99,10 @@ class Runner:
         return _take(tree, np.arange(self._lanes))
 
 
-def lane_keys(seeds: tuple[int, ...]) -> Key[Array, "L"]:
-    """One key per seed, which depends on nothing but the seed."""
-    return jax.vmap(jax.random.key)(np.asarray(seeds))
+def lane_inputs(experiment: Experiment) -> tuple[Key[Array, "L"], HParams]:
+    """Key, which depends on nothing but the seed, and hyper-parameters (leaves [L]) of every lane."""
+    keys = jax.vmap(jax.random.key)(np.asarray([lane.seed for lane in experiment.lanes]))
+    return keys, stack_hparams([lane.hparams for lane in experiment.lanes])
 
 
 def load_states(

@@ -14,7 +14,7 @@ import tyro
 
 from apt_jax.config import PRESETS, Config, HParams, check_hparams
 from apt_jax.lanes import Layout
-from experiments import run_dir
+from experiments import lanes, run_dir
 from experiments.errors import UsageError
 
 Preset = Literal["paper", "fast"]
@@ -29,10 +29,10 @@ class Experiment:
       space: the task space.
       target: the target task's name in the space, or a file that describes it.
       target_file: a file that describes the target task, whatever `target` says.
-      seeds: one lane of the compiled program each.
+      seeds: one lane of the compiled program each, for every combination of swept hyper-parameters.
       env_steps: environment steps of all sources together, warm-up included.
       config: sizes and names; a change compiles a new program.
-      hparams: numbers.
+      hparams: numbers; a field may hold a tuple of values, all of which are run.
     """
 
     space: str = "grid_world"
@@ -41,7 +41,12 @@ class Experiment:
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     env_steps: int = 100_000
     config: Config = dataclasses.field(default_factory=Config)
-    hparams: HParams = dataclasses.field(default_factory=HParams)
+    hparams: tyro.conf.Suppress[HParams] = dataclasses.field(default_factory=HParams)
+
+    @property
+    def lanes(self) -> tuple[lanes.Lane, ...]:
+        """What runs side by side."""
+        return lanes.expand(self.seeds, self.hparams)
 
 
 @dataclass(frozen=True)
@@ -53,8 +58,9 @@ class Session:
       resume: go on from the run directory's checkpoint; the experiment defaults to what is saved there.
       preset: the config and hparams to start from (paper, unless a run is resumed); other options override single fields.
       method: short for --config.method.
-      layout: how the seeds of one device are laid out.
-      devices: devices the host CPU counts as, by default one per core; seeds are spread over them.
+      layout: how the lanes of one device are laid out.
+      at_once: lanes of a device side by side under layout vmap, the others in turn, if all do not fit its memory.
+      devices: devices the host CPU counts as, by default one per core; lanes are spread over them.
       sinks: also log there.
       checkpoint_every: environment steps between checkpoints.
     """
@@ -64,6 +70,7 @@ class Session:
     preset: Preset | None = None
     method: str | None = None
     layout: Layout = "auto"
+    at_once: int | None = None
     devices: int | None = None
     sinks: tuple[SinkName, ...] = ()
     checkpoint_every: int = 10_000
@@ -73,11 +80,14 @@ class Session:
         """What to type to go on in the same way; the experiment itself is in the run directory."""
         words = ["python", "-m", "experiments.train", "--run-dir", str(self.run_dir), "--resume"]
         default = Session(self.run_dir)
-        for name in ("layout", "devices", "sinks", "checkpoint_every"):
+        for name in ("layout", "at_once", "devices", "sinks", "checkpoint_every"):
             value = getattr(self, name)
             if value != getattr(default, name):
                 words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else [value])]
         return shlex.join(words)
+
+
+Values: Any = lanes.values_type()
 
 
 @dataclass(frozen=True)
@@ -106,9 +116,13 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
     def train(
         session: Annotated[Session, tyro.conf.arg(name="")],
         experiment: Annotated[Experiment, tyro.conf.arg(name="")] = default,
+        hparams: Values = Values(**lanes.to_values(default.hparams)),  # noqa: B008
     ) -> tuple[Experiment, Session]:
-        """Train a curriculum on one target task, all seeds in one compiled program."""
-        return experiment, session
+        """Train a method on one target task, all seeds in one compiled program.
+
+        Several values of one of the hparams are a sweep: every combination runs with every seed, in the same program.
+        """
+        return dataclasses.replace(experiment, hparams=lanes.from_values(dataclasses.asdict(hparams))), session
 
     experiment, session = tyro.cli(train, args=args, prog="python -m experiments.train", config=(tyro.conf.FlagCreatePairsOff,))
     if session.method:
@@ -129,11 +143,16 @@ def check(experiment: Experiment, session: Session) -> None:
         raise UsageError(f"--seeds must not be negative, got {min(experiment.seeds)}")
     if experiment.target_file and not experiment.target_file.is_file():
         raise UsageError(f"--target-file {experiment.target_file} is no file")
-    try:
-        check_hparams(experiment.hparams)
-    except ValueError as error:
-        raise UsageError(f"--hparams: {error}") from error
-    for name in ("devices", "checkpoint_every"):
+    for name, values in lanes.swept(experiment.hparams).items():
+        if not values or len(set(values)) != len(values):
+            given = " ".join(f"{value:g}" for value in values) or "none"
+            raise UsageError(f"--hparams.{name} needs one or more different numbers, got {given}")
+    for lane in experiment.lanes:
+        try:
+            check_hparams(lane.hparams)
+        except ValueError as error:
+            raise UsageError(f"--hparams: {error}") from error
+    for name in ("at_once", "devices", "checkpoint_every"):
         value = getattr(session, name)
         if value is not None and value < 1:
             raise UsageError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
@@ -163,11 +182,16 @@ def load(directory: Path) -> Experiment:
                 "target_file": directory / saved["target_file"] if saved["target_file"] else None,
                 "seeds": tuple(saved["seeds"]),
                 "config": Config(**saved["config"]),
-                "hparams": HParams(**{name: float(value) for name, value in saved["hparams"].items()}),
+                "hparams": HParams(**{name: _numbers(value) for name, value in saved["hparams"].items()}),
             }
         )
     except (KeyError, TypeError) as error:
         raise UsageError(f"{directory} was written by another version: {error}") from error
+
+
+def _numbers(saved: Any) -> Any:
+    """A number or several, as they come out of JSON."""
+    return tuple(map(float, saved)) if isinstance(saved, list) else float(saved)
 
 
 def target_name(experiment: Experiment) -> str:

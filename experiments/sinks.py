@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.errors import UsageError
+from experiments.lanes import Lane
 
 Metrics = Mapping[str, Float[np.ndarray, "S"]]
 
@@ -19,7 +20,7 @@ class Sink(Protocol):
     """Takes the metrics of every evaluation."""
 
     def write(self, env_steps: int, metrics: Metrics) -> None:
-        """Metrics with one value per seed."""
+        """Metrics with one value per lane."""
         ...
 
     def close(self) -> None:
@@ -30,15 +31,15 @@ class Sink(Protocol):
 class TensorBoard:
     """Event files in the run directory."""
 
-    def __init__(self, run_dir: Path, start: int, seeds: Sequence[int], config: Mapping[str, Any]):
+    def __init__(self, run_dir: Path, start: int, lanes: Sequence[Lane], config: Mapping[str, Any]):
         import tensorboardX
 
-        self._seeds = seeds
+        self._lanes = lanes
         self._writer = tensorboardX.SummaryWriter(str(run_dir / "tensorboard"), purge_step=start + 1)
 
     def write(self, env_steps: int, metrics: Metrics) -> None:
-        """One scalar per metric and seed."""
-        for tag, value in _scalars(metrics, self._seeds).items():
+        """One scalar per metric and lane."""
+        for tag, value in _scalars(metrics, self._lanes).items():
             self._writer.add_scalar(tag, value, env_steps)
 
     def close(self) -> None:
@@ -49,15 +50,15 @@ class TensorBoard:
 class WeightsAndBiases:
     """One W&B run per session, sessions of one run directory in one group."""
 
-    def __init__(self, run_dir: Path, start: int, seeds: Sequence[int], config: Mapping[str, Any]):
+    def __init__(self, run_dir: Path, start: int, lanes: Sequence[Lane], config: Mapping[str, Any]):
         import wandb
 
-        self._seeds = seeds
+        self._lanes = lanes
         self._run = wandb.init(project="apt-jax", group=run_dir.name, dir=run_dir, config=dict(config))
 
     def write(self, env_steps: int, metrics: Metrics) -> None:
-        """One scalar per metric and seed."""
-        self._run.log(_scalars(metrics, self._seeds), step=env_steps)
+        """One scalar per metric and lane."""
+        self._run.log(_scalars(metrics, self._lanes), step=env_steps)
 
     def close(self) -> None:
         """Waits for the upload."""
@@ -78,11 +79,11 @@ def check_installed(names: Sequence[str]) -> None:
 
 
 def make_sinks(
-    names: Sequence[str], run_dir: Path, *, start: int, seeds: Sequence[int], config: Mapping[str, Any]
+    names: Sequence[str], run_dir: Path, *, start: int, lanes: Sequence[Lane], config: Mapping[str, Any]
 ) -> list[Sink]:
     """The sinks of those names, for a run that goes on after `start` environment steps."""
-    return [SINKS[name](run_dir, start, seeds, config) for name in names]
+    return [SINKS[name](run_dir, start, lanes, config) for name in names]
 
 
-def _scalars(metrics: Metrics, seeds: Sequence[int]) -> dict[str, float]:
-    return {f"{name}/seed_{seed}": float(values[lane]) for name, values in metrics.items() for lane, seed in enumerate(seeds)}
+def _scalars(metrics: Metrics, lanes: Sequence[Lane]) -> dict[str, float]:
+    return {f"{name}/{lane.slug}": float(values[i]) for name, values in metrics.items() for i, lane in enumerate(lanes)}

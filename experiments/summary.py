@@ -21,7 +21,7 @@ class Times:
       before: wall seconds of earlier sessions of the same run, until the checkpoint.
       compile: ahead-of-time compilation of init, warm-up and chunk.
       training: chunks, and nothing else.
-      trained_steps: environment steps of one seed in these chunks.
+      trained_steps: environment steps of one lane in these chunks.
       about: versions, device and commit, as they are when the session starts.
     """
 
@@ -39,7 +39,7 @@ class Times:
 
     @property
     def steps_per_second(self) -> float | None:
-        """Environment steps of one seed, None before the first chunk."""
+        """Environment steps of one lane, None before the first chunk."""
         return self.trained_steps / self.training if self.training else None
 
 
@@ -49,19 +49,20 @@ def summarise(path: Path, experiment: Experiment, times: Times) -> dict[str, obj
     speed = times.steps_per_second
     return {
         "env_steps": int(env_steps[-1]),
-        "seeds": {
-            str(seed): {
-                "final_target_return": _number(curves["target_return"][lane, -1]),
-                "final_target_return_raw": _number(curves["target_return_raw"][lane, -1]),
-                "best_target_return": _number(curves["target_return_raw"][lane].max()),
+        "lanes": [
+            {
+                **lane.index,
+                "final_target_return": _number(curves["target_return"][i, -1]),
+                "final_target_return_raw": _number(curves["target_return_raw"][i, -1]),
+                "best_target_return": _number(curves["target_return_raw"][i].max()),
             }
-            for lane, seed in enumerate(experiment.seeds)
-        },
+            for i, lane in enumerate(experiment.lanes)
+        ],
         "mean_final_target_return": _number(curves["target_return"][:, -1].mean()),
         "wall_seconds": round(times.wall, 2),
         "compile_seconds": round(times.compile, 2),
-        "steps_per_second_per_seed": speed and round(speed, 1),
-        "steps_per_second_all_seeds": speed and round(speed * len(experiment.seeds), 1),
+        "steps_per_second_per_lane": speed and round(speed, 1),
+        "steps_per_second_all_lanes": speed and round(speed * len(experiment.lanes), 1),
         **times.about,
     }
 

@@ -26,7 +26,7 @@ from experiments.summary import Times, is_complete, summarise
 
 T = TypeVar("T")
 
-TASKS_PER_SEED = 8
+TASKS_PER_LANE = 8
 TASKS_EVERY = 5
 """Chunks between samples of generated tasks."""
 
@@ -46,13 +46,19 @@ def train(experiment: Experiment, session: Session) -> int:
     if is_complete(run.path, experiment):
         print(f"{run.path} has all its {experiment.env_steps:,} steps; pass a larger --env-steps to go on")
         return 0
-    with Interrupt() as interrupt, make_view(experiment.seeds, experiment.env_steps) as view, ExitStack() as stack:
+    names = [lane.name for lane in experiment.lanes]
+    with (
+        Interrupt() as interrupt,
+        make_view(names, experiment.env_steps) as view,
+        ExitStack() as stack,
+    ):
         view.note(
-            f"{experiment.config.method} on {experiment.space}, seeds {' '.join(map(str, experiment.seeds))}, into {run.path}"
+            f"{experiment.config.method} on {experiment.space}, seeds {' '.join(map(str, experiment.seeds))}, "
+            f"{len(names)} lanes, into {run.path}"
         )
         sinks = [stack.enter_context(closing(sink)) for sink in open_sinks(experiment, session, run)]
         times = Times(before=run_dir.wall_seconds(run.path))
-        runner = Runner(problem.trainer, experiment, session.layout)
+        runner = Runner(problem.trainer, experiment, session.layout, session.at_once)
         Training(experiment, session, runner, run, view, sinks, interrupt, times).run()
         view.stop()
         if run_dir.wall_seconds(run.path):
@@ -68,7 +74,7 @@ def train(experiment: Experiment, session: Session) -> int:
 def open_sinks(experiment: Experiment, session: Session, run: RunDir) -> list[Sink]:
     """The sinks asked for, which go on where the run does."""
     start = checkpoint.latest_step(run.checkpoints) or 0
-    return make_sinks(session.sinks, run.path, start=start, seeds=experiment.seeds, config=dataclasses.asdict(experiment))
+    return make_sinks(session.sinks, run.path, start=start, lanes=experiment.lanes, config=dataclasses.asdict(experiment))
 
 
 def open_run(experiment: Experiment, session: Session) -> RunDir:
@@ -104,7 +110,8 @@ class Training:
             metrics = self._patiently(self.runner.advance)
             self.times.training += time.monotonic() - began
             self.times.trained_steps += self.experiment.config.eval_every
-            self.run_dir.append_metrics(self.runner.env_steps, self.times.wall, self.experiment.seeds, metrics)
+            index = [lane.index for lane in self.experiment.lanes]
+            self.run_dir.append_metrics(self.runner.env_steps, self.times.wall, index, metrics)
             self.view.write(self.runner.env_steps, metrics)
             for sink in self.sinks:
                 sink.write(self.runner.env_steps, metrics)
@@ -137,7 +144,7 @@ class Training:
 
     def _sample_tasks(self) -> None:
         if self.runner.generates:
-            self.run_dir.write_tasks(self.runner.env_steps, self.runner.propose(TASKS_PER_SEED))
+            self.run_dir.write_tasks(self.runner.env_steps, self.runner.propose(TASKS_PER_LANE))
 
     def _patiently(self, work: Callable[[], T]) -> T:
         """Does long work and stays able to answer an interrupt."""

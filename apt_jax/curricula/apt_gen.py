@@ -42,9 +42,14 @@ class AptGenState(NamedTuple):
 _ADAM = optax.flatten(optax.scale_by_adam())
 
 
-def make(space: TaskSpace, config: Config) -> Curriculum:
-    """The paper's curriculum."""
-    objectives = make_objectives(space, config)
+def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, return_weight: float = 1.0) -> Curriculum:
+    """The paper's curriculum.
+
+    Args:
+      progress_weight: of V1 in the generator's objective; 0 is the ablation "expected return only" (paper, Sec. 5.3).
+      return_weight: of V2 there; 0 is the ablation "task progress only".
+    """
+    objectives = make_objectives(space, config, progress_weight=progress_weight, return_weight=return_weight)
     networks = objectives.networks
     batch = config.model_batch_size
     recent = config.recent_steps // config.envs_per_source
@@ -149,7 +154,10 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
         )
         return AptGenState(models, opt_state, batch_stats, spectral, state.beta), metrics
 
-    def refresh(state: AptGenState, replay: rp.Replay, hparams: HParams) -> AptGenState:
+    def refresh(
+        state: AptGenState, key: Key[Array, ""], replay: rp.Replay, iteration: Int[Array, ""], hparams: HParams
+    ) -> AptGenState:
+        del key, iteration
         outcome = rp.recent_outcome(replay, source=GENERATED, window=config.return_window, since=warm)
         beta = adapt_beta(
             state.beta,

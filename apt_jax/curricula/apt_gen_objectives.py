@@ -52,8 +52,10 @@ class Objectives(NamedTuple):
     generator_loss: Callable[..., tuple[Float[Array, ""], Any]]
 
 
-def make_objectives(space: TaskSpace, config: Config) -> Objectives:
-    """The objectives for the networks that a task space's specs call for."""
+def make_objectives(
+    space: TaskSpace, config: Config, *, progress_weight: float = 1.0, return_weight: float = 1.0
+) -> Objectives:
+    """The objectives for the networks that a task space's specs call for; the generator's two terms may be weighted."""
     networks = Networks(
         Generator(space.param_spec, blank_bias=config.blank_bias),
         Discriminator(space.obs_spec, space.num_actions),
@@ -106,7 +108,9 @@ def make_objectives(space: TaskSpace, config: Config) -> Objectives:
     ) -> tuple[Float[Array, ""], Any]:
         w, batch_stats = generate(params, batch_stats, z)
         progress, outcome = (pessimistic(evaluate(ensemble, w), hparams.pessimism) for ensemble in ensembles)
-        objective = losses.generator_objective(progress, outcome, beta=beta, delta=hparams.delta)
+        objective = losses.generator_objective(
+            progress_weight * progress, outcome, beta=return_weight * beta, delta=hparams.delta
+        )
         return -objective, (batch_stats, (jnp.mean(progress), jnp.mean(outcome)))
 
     return Objectives(networks, generate, score, evaluate, discriminator_loss, value_loss, generator_loss)

@@ -37,9 +37,12 @@ class UpdateFn(Protocol):
 
 
 class RefreshFn(Protocol):
-    """`refresh(state, replay, hparams) -> state`: slow adaptation on the cadence `Config.refresh_every`."""
+    """`refresh(state, key, replay, iteration, hparams) -> state`: slow adaptation on the cadence `Config.refresh_every`.
 
-    def __call__(self, state: Any, replay: Replay, hparams: HParams) -> Any: ...
+    Consumes `key`.  `iteration` is never batched: work that is due less often goes behind a `cond` on it, and on nothing else.
+    """
+
+    def __call__(self, state: Any, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams) -> Any: ...
 
 
 class ReportFn(Protocol):
@@ -51,7 +54,8 @@ class ReportFn(Protocol):
 class Curriculum(NamedTuple):
     """A plug-in made of pure functions over an explicit state; unbatched over seeds.
 
-    `generates` is False for the null plug-in, which has no generated source: its `propose` is never called.
+    `generates` is False for the null plug-in, which has no generated source: its `propose` is never called.  `rollouts` is the
+    number of episodes that each proposed task is played for.
     """
 
     generates: bool
@@ -60,6 +64,7 @@ class Curriculum(NamedTuple):
     update: UpdateFn
     refresh: RefreshFn
     report: ReportFn
+    rollouts: int = 1
 
 
 def no_update(
@@ -70,9 +75,9 @@ def no_update(
     return state, {}
 
 
-def no_refresh(state: Any, replay: Replay, hparams: HParams) -> Any:
+def no_refresh(state: Any, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams) -> Any:
     """The `refresh` of a curriculum that does not adapt."""
-    del replay, hparams
+    del key, replay, iteration, hparams
     return state
 
 

@@ -1,6 +1,8 @@
 """The paper's networks, built from specs (appendix "Network Architectures")."""
 
 from apt_jax.networks.discriminator import Discriminator, pool
+from apt_jax.networks.distillation import Distillation
+from apt_jax.networks.dynamics import Dynamics
 from apt_jax.networks.generator import Generator
 from apt_jax.networks.q_network import QNetwork
 from apt_jax.networks.spectral import init_singular_vectors, spectral_normalize
@@ -8,6 +10,8 @@ from apt_jax.networks.value_network import ValueNetwork
 
 __all__ = [
     "Discriminator",
+    "Distillation",
+    "Dynamics",
     "Generator",
     "QNetwork",
     "ValueNetwork",

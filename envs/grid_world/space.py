@@ -59,6 +59,10 @@ class Space:
         """One move (0 up, 1 right, 2 down, 3 left); see `dynamics` for the rules."""
         return dynamics.step(state, action, task)
 
+    def fingerprint(self, state: State) -> Int[Array, "4"]:
+        """The agent's row and column, and which of the two keys are held."""
+        return jnp.concatenate([state.position, state.keys.astype(jnp.int32)])
+
     def describe(self, task: Task, target: Task) -> dict[str, Float[Array, ""]]:
         """How a task can be solved, what it is built of, and how far it is from the target.
 

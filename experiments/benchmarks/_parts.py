@@ -11,9 +11,10 @@ import optax
 from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import learner, replay, workers
-from apt_jax.curricula import apt_gen, make_curriculum
+from apt_jax.curricula import apt_gen
 from apt_jax.curricula.apt_gen_objectives import make_objectives
 from apt_jax.curricula.base import GENERATED, TARGET
+from apt_jax.methods import make_method
 from apt_jax.networks import QNetwork
 from apt_jax.specs import zeros_like
 from apt_jax.trainer import Clock, TrainState
@@ -59,7 +60,7 @@ def time_part(part: Part, clock: Clock, *, repeats: int, at_least: float) -> Tim
 def iteration_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, Part]:
     """What every iteration does, in order, and what every `refresh_every` steps adds, from a state of training."""
     space, target, config, hparams = problem
-    curriculum = make_curriculum(space, config)
+    curriculum, _ = make_method(space, config)
     network = QNetwork(space.obs_spec, space.num_actions)
     envs = config.envs_per_source
     updates = config.updates_per_step * SOURCES * envs
@@ -73,8 +74,8 @@ def iteration_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[s
         params, assignment = fixed
         key_act, key_step = jax.random.split(key)
         action = learner.epsilon_greedy(network, params, state.obs, key_act, hparams.epsilon_end)
-        state, *recorded = workers.step(space, state, action, assignment, iteration, key_step)
-        return state, recorded
+        state, transition, _, episode, done = workers.step(space, state, action, assignment, iteration, key_step)
+        return state, (transition, episode, done)
 
     def write(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         del key
@@ -108,8 +109,7 @@ def iteration_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[s
         )
 
     def refresh(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
-        del key, iteration
-        return curriculum.refresh(state, fixed, hparams), ()
+        return curriculum.refresh(state, key, fixed, iteration, hparams), ()
 
     key_propose, key_step, key_sample = jax.random.split(jax.random.key(1), 3)
     params = state.learner.params
@@ -122,7 +122,7 @@ def iteration_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[s
         "act and step": Part(act_and_step, state.workers, (params, assignment)),
         "write": Part(write, state.replay, recorded),
         "sample": Part(sample, (), state.replay),
-        "update policy": Part(update_policy, state.learner, (batches, replay.return_range(state.replay))),
+        "update policy": Part(update_policy, state.learner, (batches, state.replay.returns.bounds())),
         "update models": Part(update_models, state.curriculum, state.replay),
         "refresh": Part(refresh, state.curriculum, state.replay),
     }
@@ -204,7 +204,7 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
 def policy_update(problem: Problem, state: TrainState, batch: replay.Batch) -> Any:
     """One policy update as a call without loops, to count its operations by."""
     network = QNetwork(problem.space.obs_spec, problem.space.num_actions)
-    low, high = replay.return_range(state.replay)
+    low, high = state.replay.returns.bounds()
     return learner.update(network, state.learner, batch, low=low, high=high, hparams=problem.hparams)
 
 

@@ -1,4 +1,4 @@
-"""No curriculum: the policy learns on the target alone (plain DQN)."""
+"""No curriculum: the policy learns on the target alone."""
 
 from __future__ import annotations
 
@@ -21,6 +21,6 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
         return ()
 
     def propose(state: Any, key: Key[Array, ""], n: int, hparams: HParams) -> Params:
-        raise ValueError("target_only generates no tasks")
+        raise ValueError("without a curriculum no tasks are generated")
 
     return Curriculum(False, init, propose, no_update, no_refresh, no_report)

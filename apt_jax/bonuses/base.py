@@ -1,0 +1,139 @@
+"""The interface of a bonus: a reward of the agent's own making, added to what the environment pays.
+
+Replay keeps what the environment paid.  The bonus of a step is recomputed from today's networks whenever the step is sampled;
+only what cannot be recomputed later is noted down when it is made.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from apt_jax.config import Config, HParams
+from apt_jax.replay import Batch, Replay, ReturnRange, Transition, sample_transitions
+from apt_jax.specs import Obs
+from apt_jax.task_space import TaskSpace
+
+Metrics = dict[str, Float[Array, ""]]
+
+
+class Step(NamedTuple):
+    """One step of every environment; leaves [S, E, ...].
+
+    `state` is the true state after it, `begun` the one that the next step starts from: that of a fresh episode where the
+    transition is done, else the same.
+    """
+
+    transition: Transition
+    state: Any
+    begun: Any
+
+
+class Steps(Protocol):
+    """Steps to be paid for, with any leading axes: a `Batch` or a `Transition`."""
+
+    @property
+    def obs(self) -> Obs: ...
+    @property
+    def action(self) -> Int[Array, "..."]: ...
+    @property
+    def next_obs(self) -> Obs: ...
+    @property
+    def note(self) -> Any: ...
+
+
+class InitFn(Protocol):
+    """`init(key, states, hparams) -> state`, for the environments' first states (leaves [S, E, ...]); consumes `key`."""
+
+    def __call__(self, key: Key[Array, ""], states: Any, hparams: HParams) -> Any: ...
+
+
+class AnnotateFn(Protocol):
+    """`annotate(state, step, hparams) -> (state, note)`: when steps are made; notes have leaves [S, E, ...]."""
+
+    def __call__(self, state: Any, step: Step, hparams: HParams) -> tuple[Any, Any]: ...
+
+
+class RewardFn(Protocol):
+    """`reward(state, batch, hparams) -> (reward, metrics)`: what to train on, the bonus added, for any leading axes."""
+
+    def __call__(self, state: Any, batch: Batch, hparams: HParams) -> tuple[Float[Array, "..."], Metrics]: ...
+
+
+class UpdateFn(Protocol):
+    """`update(state, key, replay, iteration, hparams) -> (state, metrics)`: one round of learning; consumes `key`."""
+
+    def __call__(
+        self, state: Any, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
+    ) -> tuple[Any, Metrics]: ...
+
+
+class ReturnRangeFn(Protocol):
+    """`return_range(state, replay) -> (low, high)`: range of episodic returns in the reward that is trained on."""
+
+    def __call__(self, state: Any, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]: ...
+
+
+class Bonus(NamedTuple):
+    """A plug-in made of pure functions over an explicit state; unbatched over seeds.
+
+    `note` is the structure (`ShapeDtypeStruct`s) of what `annotate` keeps of one step.
+    """
+
+    note: Any
+    init: InitFn
+    annotate: AnnotateFn
+    reward: RewardFn
+    update: UpdateFn
+    return_range: ReturnRangeFn
+
+
+class Stream(NamedTuple):
+    """Episodic returns in the reward that is trained on, as it was when the steps were made: what the next-Q clip needs."""
+
+    episode_return: Float[Array, "S E"]
+    returns: ReturnRange
+
+    @classmethod
+    def start(cls, shape: tuple[int, int]) -> Stream:
+        """Before the first step of S x E environments."""
+        return cls(jnp.zeros(shape), ReturnRange.empty())
+
+    def step(self, reward: Float[Array, "S E"], done: Bool[Array, "S E"]) -> Stream:
+        """After a step that paid `reward`, bonus included."""
+        episode_return = self.episode_return + reward
+        return Stream(jnp.where(done, 0.0, episode_return), self.returns.extend(episode_return, done))
+
+
+def pay(batch: Batch, bonus: Float[Array, "..."]) -> tuple[Float[Array, "..."], Metrics]:
+    """Both rewards together, and each alone as a metric."""
+    metrics = {"extrinsic_reward": jnp.mean(batch.reward), "intrinsic_reward": jnp.mean(bonus)}
+    return batch.reward + bonus, metrics
+
+
+def sample(
+    space: TaskSpace, config: Config, replay: Replay, key: Key[Array, ""], iteration: Int[Array, ""]
+) -> tuple[Obs, Int[Array, "B"], Obs]:
+    """Observation, action and next observation of `model_batch_size` steps of all sources; consumes `key`."""
+    batch = sample_transitions(
+        replay,
+        key,
+        iteration,
+        batches=1,
+        batch_size=config.model_batch_size,
+        n_step=1,
+        gamma=1.0,
+        episode_share=0.0,
+        horizon=space.horizon,
+    )
+    obs, next_obs = ({name: block[0] for name, block in side.items()} for side in (batch.obs, batch.next_obs))
+    return obs, batch.action[0], next_obs
+
+
+def leading(states: Any) -> tuple[int, int]:
+    """Sources and environments of states with leaves [S, E, ...]."""
+    sources, envs = jax.tree.leaves(states)[0].shape[:2]
+    return sources, envs

@@ -1,0 +1,122 @@
+"""RND: paid for states on which a network has not yet learned a fixed random function (Burda et al. 2019)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, Key
+
+from apt_jax.bonuses.base import Bonus, Metrics, Step, Steps, Stream, leading, pay, sample
+from apt_jax.bonuses.moments import Moments
+from apt_jax.config import Config, HParams
+from apt_jax.networks import Distillation
+from apt_jax.networks.apply import apply
+from apt_jax.networks.encoders import Features, observation_features
+from apt_jax.replay import Batch, Replay
+from apt_jax.specs import Obs, obs_struct, zeros_like
+from apt_jax.task_space import TaskSpace
+
+DISCOUNT = 0.99
+"""Of the return whose deviation is the bonus's unit."""
+
+CLIP = 5.0
+"""Bound of normalised observations, in deviations."""
+
+EPSILON = 1e-8
+"""Added to variances: some inputs never change."""
+
+_ADAM = optax.flatten(optax.scale_by_adam())
+
+
+class RndState(NamedTuple):
+    """Both networks, the predictor's optimiser, and running statistics, all of them taken when steps are made.
+
+    `filtered` is each environment's forward-filtered return of bonuses, across episodes; `scale` holds its moments.
+    """
+
+    target: Any
+    predictor: Any
+    opt_state: Any
+    features: dict[str, Moments]
+    filtered: Float[Array, "S E"]
+    scale: Moments
+    stream: Stream
+
+
+def make(space: TaskSpace, config: Config) -> Bonus:
+    """Mean squared error of the predictor, over the deviation of its filtered return, times `HParams.rnd_scale`.
+
+    Observations are normalised by what has been seen since the first, uniformly random, step.
+    """
+    target_network = Distillation(space.obs_spec, deeper=False)
+    predictor_network = Distillation(space.obs_spec, deeper=True)
+
+    def init(key: Key[Array, ""], states: Any, hparams: HParams) -> RndState:
+        del hparams
+        key_target, key_predictor = jax.random.split(key)
+        features = observation_features(space.obs_spec, zeros_like(obs_struct(space.obs_spec)))
+        predictor = predictor_network.init(key_predictor, features)
+        return RndState(
+            target=target_network.init(key_target, features),
+            predictor=predictor,
+            opt_state=_ADAM.init(predictor),
+            features={name: Moments.start(block.shape) for name, block in features.items()},
+            filtered=jnp.zeros(leading(states)),
+            scale=Moments.start(),
+            stream=Stream.start(leading(states)),
+        )
+
+    def error(state: RndState, predictor: Any, next_obs: Obs) -> Float[Array, "..."]:
+        features = normalise(state.features, observation_features(space.obs_spec, next_obs))
+        wanted = jax.lax.stop_gradient(apply(target_network, state.target, features))
+        return jnp.mean((apply(predictor_network, predictor, features) - wanted) ** 2, axis=-1)
+
+    def bonus(state: RndState, steps: Steps, hparams: HParams) -> Float[Array, "..."]:
+        unit = jnp.sqrt(state.scale.variance + EPSILON)
+        return hparams.rnd_scale * error(state, state.predictor, steps.next_obs) / unit
+
+    def annotate(state: RndState, step: Step, hparams: HParams) -> tuple[RndState, Any]:
+        features = observation_features(space.obs_spec, step.transition.next_obs)
+        flat = {name: block.reshape(-1, *block.shape[2:]) for name, block in features.items()}
+        state = state._replace(features={name: state.features[name].extend(block) for name, block in flat.items()})
+        filtered = forward_filter(state.filtered, error(state, state.predictor, step.transition.next_obs))
+        state = state._replace(filtered=filtered, scale=state.scale.extend(filtered.reshape(-1)))
+        paid = step.transition.reward + bonus(state, step.transition, hparams)
+        return state._replace(stream=state.stream.step(paid, step.transition.done)), ()
+
+    def reward(state: RndState, batch: Batch, hparams: HParams) -> tuple[Float[Array, "..."], Metrics]:
+        return pay(batch, bonus(state, batch, hparams))
+
+    def update(
+        state: RndState, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
+    ) -> tuple[RndState, Metrics]:
+        _, _, next_obs = sample(space, config, replay, key, iteration)
+        loss, grads = jax.value_and_grad(lambda params: jnp.mean(error(state, params, next_obs)))(state.predictor)
+        direction, opt_state = _ADAM.update(grads, state.opt_state)
+        predictor = jax.tree.map(lambda p, d: p - hparams.bonus_learning_rate * d, state.predictor, direction)
+        return state._replace(predictor=predictor, opt_state=opt_state), {"rnd_loss": loss}
+
+    def return_range(state: RndState, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        del replay
+        return state.stream.returns.bounds()
+
+    return Bonus((), init, annotate, reward, update, return_range)
+
+
+def forward_filter(filtered: Float[Array, "S E"], bonus: Float[Array, "S E"]) -> Float[Array, "S E"]:
+    """The discounted sum of all bonuses until now, never reset at an episode's end."""
+    return DISCOUNT * filtered + bonus
+
+
+def normalise(moments: dict[str, Moments], features: Features) -> Features:
+    """Deviations from the mean, clipped, with any leading axes."""
+
+    def block(moments: Moments, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        lead = (1,) * (x.ndim - moments.mean.ndim)
+        mean, variance = (values.reshape(*lead, *values.shape) for values in (moments.mean, moments.variance))
+        return jnp.clip((x - mean) / jnp.sqrt(variance + EPSILON), -CLIP, CLIP)
+
+    return {name: block(moments[name], x) for name, x in features.items()}
