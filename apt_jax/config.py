@@ -128,8 +128,8 @@ class Config:
       warmup_steps: steps collected by a uniformly random policy before any update (paper: 10,000).
       updates_per_step: policy updates per environment step (paper: 10).
       batch_size: transitions per policy update, drawn equally from the sources (paper: 128).
-      episode_share: share of a policy update's transitions drawn by episode, in [0, 1]: short episodes, solved or
-        fatal, then weigh as much as those that run into the horizon; the others are drawn uniformly (the paper names none: 0).
+      success_share: share of a policy update's transitions drawn from successful episodes, in [0, 1], once a source has any,
+        so that what is rare is not lost among steps that led nowhere (the paper names none: 0).
       n_step: rewards summed up before the Q-learning target bootstraps (the paper names none: 1).
       replay_steps: capacity of each source's replay, in steps of that source.
       replay_episodes: capacity of each source's ring of finished episodes.
@@ -162,7 +162,7 @@ class Config:
     warmup_steps: int = 10_000
     updates_per_step: int = 10
     batch_size: int = 128
-    episode_share: float = 0.0
+    success_share: float = 0.0
     n_step: int = 1
     replay_steps: int = 100_000
     replay_episodes: int = 10_000
@@ -194,7 +194,7 @@ PRESETS: dict[str, tuple[Config, HParams]] = {
         Config(
             envs_per_source=5,
             updates_per_step=2,
-            episode_share=0.5,
+            success_share=0.25,
             model_updates_per_step=0.2,
             model_batch_size=64,
             recent_steps=20_000,

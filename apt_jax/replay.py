@@ -169,7 +169,7 @@ def sample_transitions(
     batch_size: int,
     n_step: int,
     gamma: Float[Array, ""] | float,
-    episode_share: float,
+    success_share: float,
     horizon: int,
 ) -> Batch:
     """`batches` of `batch_size` n-step transitions in equal shares from the sources; consumes `key`.
@@ -178,8 +178,8 @@ def sample_transitions(
 
     Args:
       iteration: the latest iteration written.
-      episode_share: share drawn as a step of a uniformly drawn finished episode, in [0, 1]: short episodes, solved or fatal,
-        then weigh as much as those that run into the horizon; the others are drawn uniformly from all steps.
+      success_share: share drawn as a step of a successful episode, in [0, 1], as far as a source has any; the others are drawn
+        uniformly from all steps.
       horizon: steps of the longest possible episode; an episode that ended too long ago to be whole is not drawn.
 
     Returns:
@@ -187,12 +187,13 @@ def sample_transitions(
     """
     sources, envs, columns = replay.transitions.action.shape
     share = batch_size // sources
-    key_step, key_episode = jax.random.split(key)
-    from_episodes = round(episode_share * share)
-    drawn = [_draw_steps(replay, key_step, iteration, (sources, batches, share - from_episodes))]
-    if from_episodes:
-        drawn.append(_draw_by_episode(replay, key_episode, iteration, (sources, batches, from_episodes), horizon))
-    env, first = (jnp.concatenate(parts, axis=-1) for parts in zip(*drawn, strict=True))
+    key_step, key_success = jax.random.split(key)
+    env, first = _draw_steps(replay, key_step, iteration, (sources, batches, share))
+    from_successes = round(success_share * share)
+    if from_successes:
+        kept, replaced = ((env[..., part], first[..., part]) for part in (slice(from_successes, None), slice(from_successes)))
+        drawn = _draw_successes(replay, key_success, iteration, horizon, otherwise=replaced)
+        env, first = (jnp.concatenate(parts, axis=-1) for parts in zip(drawn, kept, strict=True))
     row = (jnp.arange(sources, dtype=jnp.int32)[:, None, None] * envs + env) * columns
 
     # One flat index over sources, environments and columns: a single leading index is the cheapest gather on every backend.
@@ -232,21 +233,24 @@ def _draw_steps(replay: Replay, key: Key[Array, ""], iteration: Int[Array, ""], 
     return env, iteration - age
 
 
-def _draw_by_episode(
-    replay: Replay, key: Key[Array, ""], iteration: Int[Array, ""], shape: tuple[int, int, int], horizon: int
+def _draw_successes(
+    replay: Replay, key: Key[Array, ""], iteration: Int[Array, ""], horizon: int, *, otherwise: Positions
 ) -> Positions:
-    """Finished episodes drawn uniformly, and of each a step drawn uniformly; consumes `key`."""
+    """Successful episodes drawn uniformly, and of each a step drawn uniformly, where a source has any; consumes `key`."""
     columns = replay.transitions.action.shape[2]
-    slots = replay.episodes.end.shape[1]
     key_episode, key_step = jax.random.split(key)
+    shape = otherwise[0].shape
     # The first steps of an episode that ended longer ago may be overwritten.
-    count = jnp.sum(replay.episodes.end > iteration - columns + horizon, axis=1, dtype=jnp.int32)[:, None, None]
-    back = jax.random.randint(key_episode, shape, 0, jnp.maximum(count, 1))
-    slot = (replay.finished[:, None, None] - 1 - back) % slots
+    whole = replay.episodes.end > iteration - columns + horizon
+    counted = jnp.cumsum(whole & replay.episodes.success, axis=1, dtype=jnp.int32)
+    count = counted[:, -1][:, None, None]
+    rank = 1 + jax.random.randint(key_episode, shape, 0, jnp.maximum(count, 1))
+    slot = jax.vmap(jnp.searchsorted)(counted, rank)
     source = jnp.arange(shape[0], dtype=jnp.int32)[:, None, None]
-    length = replay.episodes.length[source, slot]
-    age = jax.random.randint(key_step, shape, 0, length)
-    return replay.episodes.env[source, slot], replay.episodes.end[source, slot] - age
+    age = jax.random.randint(key_step, shape, 0, replay.episodes.length[source, slot])
+    drawn = replay.episodes.env[source, slot], replay.episodes.end[source, slot] - age
+    env, first = (jnp.where(count > 0, new, old) for new, old in zip(drawn, otherwise, strict=True))
+    return env, first
 
 
 def sample_rollouts(

@@ -151,7 +151,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             batches=config.updates_per_step * steps,
             batch_size=config.batch_size,
             n_step=config.n_step,
-            episode_share=config.episode_share,
+            success_share=config.success_share,
             horizon=space.horizon,
             gamma=hparams.gamma,
         )
@@ -318,11 +318,11 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
         config.batch_size >= sources and config.batch_size % sources == 0,
         f"batch_size must be a positive multiple of the {sources} sources, got {config.batch_size}",
     )
-    drawn = config.episode_share * (config.batch_size // sources)
+    drawn = config.success_share * (config.batch_size // sources)
     require(
-        0.0 <= config.episode_share <= 1.0 and (round(drawn) >= 1 or drawn == 0.0),
-        f"episode_share must lie in [0, 1] and be 0 or give at least one of {config.batch_size // sources} transitions, "
-        f"got {config.episode_share:g}",
+        0.0 <= config.success_share <= 1.0 and (round(drawn) >= 1 or drawn == 0.0),
+        f"success_share must lie in [0, 1] and be 0 or give at least one of {config.batch_size // sources} transitions, "
+        f"got {config.success_share:g}",
     )
     require(
         config.warmup_steps >= horizon * steps,

@@ -82,9 +82,9 @@ def test_finished_episodes_are_kept_in_order_and_counted(iterations):
 def test_return_range_covers_finished_episodes_of_all_sources_and_is_unbounded_before():
     rings, finished = _written(30)
     returns = [episode[3] for source in finished for episode in source]
-    np.testing.assert_allclose(replay.return_range(rings), [min(returns), max(returns)])
+    np.testing.assert_allclose(rings.returns.bounds(), [min(returns), max(returns)])
     empty = replay.init(OBS, PARAM, sources=SOURCES, envs=ENVS, columns=COLUMNS, episodes=SLOTS)
-    np.testing.assert_array_equal(replay.return_range(empty), [-np.inf, np.inf])
+    np.testing.assert_array_equal(empty.returns.bounds(), [-np.inf, np.inf])
 
 
 @pytest.mark.parametrize("iterations", [3, 41])
@@ -98,7 +98,7 @@ def test_sampled_transitions_are_whole_recent_and_equally_shared(iterations):
         batch_size=64,
         n_step=1,
         gamma=0.5,
-        episode_share=0.0,
+        success_share=0.0,
         horizon=1,
     )
     code = np.asarray(batch.reward)
@@ -113,10 +113,32 @@ def test_sampled_transitions_are_whole_recent_and_equally_shared(iterations):
     assert len(np.unique(code)) == written, "3,200 draws from at most 96 rows miss none"
 
 
-def test_a_share_of_transitions_is_drawn_by_episode():
-    """Every finished episode that is still whole is as likely as any other, whatever its length, and every step of it."""
+def test_a_share_of_transitions_is_drawn_from_successful_episodes():
+    """Every one that is still whole is as likely as any other, whatever its length, and every step of it."""
     rings, finished = _written(41, seed=3)
     longest = max(episode[2] for source in finished for episode in source[-SLOTS:])
+    batch = _sample_successes(rings, longest)
+    for source in range(SOURCES):
+        whole = [episode for episode in finished[source][-SLOTS:] if episode[1] > 40 - COLUMNS + longest]
+        successes = [episode for episode in whole if episode[3] > 0]
+        assert 1 < len(successes) < len(whole)
+        drawn = batch[:, source, :24].ravel()
+        for env, end, length, _ in successes:
+            counts = [np.mean(drawn == _code(source, env, iteration)) for iteration in range(end - length + 1, end + 1)]
+            np.testing.assert_allclose(counts, 1 / len(successes) / length, atol=0.02)
+            np.testing.assert_allclose(np.sum(counts), 1 / len(successes), atol=0.02)
+
+
+def test_a_source_without_success_is_drawn_uniformly():
+    rings, finished = _written(41, seed=3)
+    longest = max(episode[2] for source in finished for episode in source[-SLOTS:])
+    failed = rings.episodes.success.at[0].set(False)
+    batch = _sample_successes(rings._replace(episodes=rings.episodes._replace(success=failed)), longest)
+    assert len(np.unique(batch[:, 0, :24])) == COLUMNS * ENVS, "every step of the ring"
+    assert len(np.unique(batch[:, 1, :24])) < COLUMNS * ENVS
+
+
+def _sample_successes(rings, horizon):
     batch = replay.sample_transitions(
         rings,
         jax.random.key(1),
@@ -125,18 +147,10 @@ def test_a_share_of_transitions_is_drawn_by_episode():
         batch_size=64,
         n_step=1,
         gamma=0.5,
-        episode_share=0.75,
-        horizon=longest,
+        success_share=0.75,
+        horizon=horizon,
     )
-    code = np.asarray(batch.reward).reshape(400, SOURCES, 32).astype(int)[..., -24:]
-    for source in range(SOURCES):
-        whole = [episode for episode in finished[source][-SLOTS:] if episode[1] > 40 - COLUMNS + longest]
-        assert len(whole) > 2
-        drawn = code[:, source].ravel()
-        for env, end, length, _ in whole:
-            counts = [np.mean(drawn == _code(source, env, iteration)) for iteration in range(end - length + 1, end + 1)]
-            np.testing.assert_allclose(counts, 1 / len(whole) / length, atol=0.02)
-            np.testing.assert_allclose(np.sum(counts), 1 / len(whole), atol=0.02)
+    return np.asarray(batch.reward).reshape(400, SOURCES, 32).astype(int)
 
 
 @pytest.mark.parametrize("n_step", [1, 2, 4])
@@ -152,7 +166,7 @@ def test_n_step_transitions_stop_at_the_end_of_the_episode_and_of_what_is_writte
         batch_size=64,
         n_step=n_step,
         gamma=gamma,
-        episode_share=0.0,
+        success_share=0.0,
         horizon=1,
     )
     batch = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[2:]), batch)

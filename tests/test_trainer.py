@@ -35,7 +35,7 @@ CONFIG = Config(
     probe_tasks=8,
     return_window=10,
 )
-SWITCHES = {"relative_progress": True, "blank_bias": 2.0, "episode_share": 0.5, "value_ensemble": 2}
+SWITCHES = {"relative_progress": True, "blank_bias": 2.0, "success_share": 0.5, "value_ensemble": 2}
 """What preset "fast" has beyond the paper."""
 METHODS = ("apt_gen", "random", "target_only")
 
@@ -223,8 +223,8 @@ def test_resuming_from_a_checkpoint_equals_never_having_stopped(tmp_path, stop):
         ({"warmup_steps": 40}, "warmup_steps .* at least 48, got 40"),
         ({"model_updates_per_step": 0.3}, "whole number of updates"),
         ({"replay_steps": 100}, "replay_steps .* at least 124"),
-        ({"episode_share": 1.5}, "episode_share must lie in"),
-        ({"episode_share": 0.01}, "at least one of 8 transitions, got 0.01"),
+        ({"success_share": 1.5}, "success_share must lie in"),
+        ({"success_share": 0.01}, "at least one of 8 transitions, got 0.01"),
         ({"envs_per_source": 0}, "envs_per_source"),
         ({"eval_episodes": 0}, "eval_episodes must be at least 1"),
     ],

@@ -126,7 +126,7 @@ def sample(
         batch_size=config.model_batch_size,
         n_step=1,
         gamma=1.0,
-        episode_share=0.0,
+        success_share=0.0,
         horizon=space.horizon,
     )
     obs, next_obs = ({name: block[0] for name, block in side.items()} for side in (batch.obs, batch.next_obs))

@@ -90,7 +90,7 @@ def iteration_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[s
             batches=updates,
             batch_size=config.batch_size,
             n_step=config.n_step,
-            episode_share=config.episode_share,
+            success_share=config.success_share,
             horizon=space.horizon,
             gamma=hparams.gamma,
         )
