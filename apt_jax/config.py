@@ -197,6 +197,7 @@ PRESETS: dict[str, tuple[Config, HParams]] = {
             success_share=0.25,
             model_updates_per_step=0.2,
             model_batch_size=64,
+            rollout_steps=2,
             recent_steps=20_000,
             relative_progress=True,
             blank_bias=2.0,
@@ -204,7 +205,7 @@ PRESETS: dict[str, tuple[Config, HParams]] = {
         ),
         HParams(
             learning_rate=1e-3,
-            generator_learning_rate=1e-3,
+            generator_learning_rate=7e-4,
             gamma=0.97,
             value_weight_decay=10.0,
             cell_noise=0.03,
