@@ -211,17 +211,16 @@ LOCK_HPARAMS = HParams(
 
 @pytest.mark.parametrize("method", ["dqn", "icm", "rnd", "ride"])
 def test_bonuses_open_a_lock_that_plain_dqn_does_not(method):
-    """One sequence of ten in 59,049 pays: over five seeds, plain DQN never meets it in 4,500 steps."""
+    """One sequence of ten in 59,049 pays: over five seeds, plain DQN never meets it in 6,500 steps."""
     config = Config(**{**vars(LOCK_CONFIG), "method": method})
     program = make_program(make_trainer(Lock(), np.int32(0), config), 5)
     lanes = stack_hparams([LOCK_HPARAMS] * 5)
     states = program.init(jax.vmap(jax.random.key)(np.arange(5)), lanes)
     states, clock = program.warmup(states, Clock.start(), lanes)
-    solved = np.zeros(5, bool)
-    for _ in range(4):
-        states, clock, metrics = program.chunk(states, clock, lanes)
-        solved |= np.asarray(metrics["target_return"]) == 1.0
+    for _ in range(6):
+        states, clock, _ = program.chunk(states, clock, lanes)
+    opened = np.asarray(jnp.any(states.replay.transitions.reward > 0, axis=(1, 2, 3)))
     if method == "dqn":
-        assert not solved.any()
+        assert not opened.any()
     else:
-        assert solved.sum() >= 4, solved
+        assert opened.sum() >= 4, opened

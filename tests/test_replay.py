@@ -82,9 +82,9 @@ def test_finished_episodes_are_kept_in_order_and_counted(iterations):
 def test_return_range_covers_finished_episodes_of_all_sources_and_is_unbounded_before():
     rings, finished = _written(30)
     returns = [episode[3] for source in finished for episode in source]
-    np.testing.assert_allclose(replay.return_range(rings), [min(returns), max(returns)])
+    np.testing.assert_allclose(rings.returns.bounds(), [min(returns), max(returns)])
     empty = replay.init(OBS, PARAM, sources=SOURCES, envs=ENVS, columns=COLUMNS, episodes=SLOTS)
-    np.testing.assert_array_equal(replay.return_range(empty), [-np.inf, np.inf])
+    np.testing.assert_array_equal(empty.returns.bounds(), [-np.inf, np.inf])
 
 
 @pytest.mark.parametrize("iterations", [3, 41])
