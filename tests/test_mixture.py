@@ -38,7 +38,7 @@ class FromLabels(GaussianMixture):
         super().__init__(**kwargs)
         self.labels = labels
 
-    def _initialize_parameters(self, X, random_state, *args):
+    def _initialize_parameters(self, X, random_state, **kwargs):
         self._initialize(X, np.eye(self.n_components)[self.labels])
 
 
