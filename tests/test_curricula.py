@@ -183,7 +183,7 @@ def teach(curriculum, outcome, rounds, key):
             key, key_one = jax.random.split(key)
             return (curriculum.update(state, key_one, rings, steps, hparams)[0], key), None
 
-        (state, _), _ = jax.lax.scan(update, (state, key_update), length=100)
+        (state, _), _ = jax.lax.scan(update, (state, key_update), length=40)
         return (state, rings, key), None
 
     (state, _, _), _ = jax.lax.scan(round_, (state, rings, key_rounds), jnp.arange(rounds, dtype=jnp.int32))
@@ -191,14 +191,13 @@ def teach(curriculum, outcome, rounds, key):
 
 
 def test_alp_gmm_goes_where_returns_change():
-    """Returns rise over time in one quarter of the plane, stay 1 in another and 0 elsewhere: uniform tasks hit it by 25 %."""
+    """Returns rise over time in one quarter of the plane and depend on nothing but the place elsewhere."""
     curriculum = alp_gmm.make(Plane(), CONFIG)
 
     def outcome(at, time, key):
-        rising, easy = jnp.all(at > 0.5, axis=1), jnp.all(at < 0.5, axis=1)
+        rising = jnp.all(at > 0.5, axis=1)
         noise = 0.02 * jax.random.normal(key, at.shape[:1])
-        wave = 0.5 + 0.5 * jnp.sin(40.0 * time + 9.0 * at[:, 0])
-        return jnp.where(rising, wave, easy.astype(jnp.float32)) + noise, easy
+        return jnp.where(rising, 2.0 * time, 0.5 * at[:, 0]) + noise, rising
 
     run = jax.jit(lambda keys: jax.lax.map(lambda key: teach(curriculum, outcome, 12, key)[0], keys))
     tasks = run(jax.random.split(jax.random.key(0), 5))
