@@ -132,11 +132,11 @@ def test_a_seed_of_another_method_alone_equals_the_same_seed_beside_one(method):
 def test_lanes_may_be_laid_out_in_groups():
     """Five lanes on two devices, two at once on each."""
     trainer = make_trainer(SPACE, TARGET, config("dqn"))
-    keys = jax.vmap(jax.random.key)(np.arange(5))
     lanes = stack_hparams([HParams()] * 5)
 
     def states(**options):
         compiled = make_program(trainer, 5, layout="vmap", **options)
+        keys = jax.vmap(jax.random.key)(np.arange(5))
         return compiled.warmup(compiled.init(keys, lanes), Clock.start(), lanes)[0]
 
     for a, b in zip(leaves(states(at_once=2)), leaves(states()), strict=True):
