@@ -115,7 +115,7 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
 
     def train(
         session: Annotated[Session, tyro.conf.arg(name="")],
-        experiment: Annotated[Experiment, tyro.conf.arg(name="")] = default,
+        experiment: Annotated[Experiment, tyro.conf.arg(name="")] = dataclasses.replace(default, hparams=HParams()),  # noqa: B008
         hparams: Values = Values(**lanes.to_values(default.hparams)),  # noqa: B008
     ) -> tuple[Experiment, Session]:
         """Train a method on one target task, all seeds in one compiled program.

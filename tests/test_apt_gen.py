@@ -41,13 +41,22 @@ def experience():
     return jax.tree.map(lambda x: x[0], states.replay), clock.iteration - 1
 
 
-@pytest.mark.parametrize(("beta", "optimum"), [(0.125, 2.667), (3.0, 6.5), (8.0, 7.333)])
-def test_generator_reaches_the_optimum_of_v1_plus_beta_v2(monkeypatch, experience, beta, optimum):
-    """V1 peaks at 2 and V2 at 8, so the sum peaks at (2 + 8 beta) / (1 + beta)."""
+@pytest.mark.parametrize(
+    ("beta", "weights", "optimum"),
+    [
+        (0.125, {}, 2.667),
+        (3.0, {}, 6.5),
+        (8.0, {}, 7.333),
+        (1.0, {"progress_weight": 0.0}, 8.0),
+        (1.0, {"return_weight": 0.0}, 2.0),
+    ],
+)
+def test_generator_reaches_the_optimum_of_v1_plus_beta_v2(monkeypatch, experience, beta, weights, optimum):
+    """V1 peaks at 2 and V2 at 8, so the sum peaks at (2 + 8 beta) / (1 + beta); an ablation leaves one of them."""
     monkeypatch.setattr(objectives, "ValueNetwork", Bowl)
     replay, iteration = experience
     hparams = HParams(value_learning_rate=0.0, generator_learning_rate=1e-2, vector_noise=0.0)
-    curriculum = apt_gen.make(SPACE, CONFIG)
+    curriculum = apt_gen.make(SPACE, CONFIG, **weights)
     state = curriculum.init(jax.random.key(0), hparams)
     v1, v2 = ({"params": {"centre": jnp.full(1, c)}} for c in (2.0, 8.0))  # ensembles of one
     state = state._replace(models=state.models._replace(progress_value=v1, return_value=v2), beta=jnp.float32(beta))
@@ -168,7 +177,8 @@ def generated_episodes(returns, ends):
 def test_beta_follows_only_what_ended_after_the_warm_up(returns, ends, beta):
     curriculum = apt_gen.make(SPACE, CONFIG)
     state = jax.eval_shape(curriculum.init, jax.random.key(0), HParams())._replace(beta=jnp.float32(1.0))
-    assert curriculum.refresh(state, generated_episodes(returns, ends), HParams()).beta == beta
+    refreshed = curriculum.refresh(state, jax.random.key(1), generated_episodes(returns, ends), jnp.int32(30), HParams())
+    assert refreshed.beta == beta
 
 
 def test_rollouts_hold_the_steps_of_their_episode_only():

@@ -19,7 +19,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"config", "task_space"}),
     frozenset({"losses", "networks", "replay"}),
     frozenset({"bonuses", "curricula", "learner"}),
-    frozenset({"evaluation", "workers"}),
+    frozenset({"evaluation", "methods", "workers"}),
     frozenset({"trainer"}),
     frozenset({"checkpoint", "lanes", "logging"}),
     frozenset({"__init__"}),  # the package's own face

@@ -24,9 +24,22 @@ def test_learning_curves_skip_metrics_a_method_lacks(tmp_path):
     widths = []
     for name, curves in {"one": one, "four": four}.items():
         file = tmp_path / f"{name}.png"
-        plots.learning_curves(file, env_steps, curves, seeds=(0, 3), delta=0.5, title=name)
+        seeds = np.array([[0.0] * 5, [3.0] * 5])
+        plots.learning_curves(file, {"": (env_steps, {**curves, "seed": seeds})}, delta=0.5, title=name)
         widths.append(read(file).shape[1])
     assert widths[1] == 4 * widths[0]
+
+
+def test_comparisons_have_a_panel_per_target_and_curves_a_colour_per_setting(tmp_path):
+    run = (
+        np.arange(1, 6) * 1000,
+        {"target_return": np.linspace(0, 1, 10).reshape(2, 5), "seed": np.array([[0.0] * 5, [3.0] * 5])},
+    )
+    plots.comparison(tmp_path / "two.png", {"A": {"dqn": run, "rnd": run}, "B": {"rnd": run}})
+    plots.comparison(tmp_path / "three.png", {name: {"dqn": run} for name in "ABC"})
+    assert 2 * read(tmp_path / "three.png").shape[1] == 3 * read(tmp_path / "two.png").shape[1]
+    plots.learning_curves(tmp_path / "sweep.png", {"delta 0.1": run, "delta 0.3": run}, delta=None, title="sweep")
+    assert read(tmp_path / "sweep.png").std() > 0
 
 
 def test_progression_and_gallery(tmp_path):

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apt_jax.config import PRESETS, Config
+from apt_jax.config import PRESETS, Config, HParams
 from experiments import evaluate, run_dir, settings, sinks, train
 from experiments.errors import UsageError
 from experiments.problem import make_problem
@@ -44,6 +44,10 @@ def start_run(path: Path, *options: str) -> Experiment:
     [
         ("--seeds 1 2 1", "--seeds needs .* different .* got 1 2 1"),
         ("--seeds -1", "must not be negative"),
+        ("--hparams.delta 0.1 0.1", "--hparams.delta needs .* different numbers, got 0.1 0.1"),
+        ("--hparams.gamma 0.9 1.5", "gamma must be in .* got 1.5"),
+        ("--at-once 0", "--at-once must be at least 1"),
+        ("--method apt_gen+rdn", "closest is 'rnd'"),
         ("--devices 0", "--devices must be at least 1"),
         ("--checkpoint-every 0", "--checkpoint-every must be at least 1"),
         ("--target-file missing.txt", "missing.txt is no file"),
@@ -73,6 +77,34 @@ def test_options_override_the_preset(tmp_path):
     config, hparams = PRESETS["fast"]
     assert experiment.config == dataclasses.replace(config, batch_size=64)
     assert experiment.hparams == hparams.replace(delta=0.3)
+
+
+def test_several_values_are_a_sweep_over_every_seed(tmp_path):
+    deltas = ["-0.1", "0.1", "0.3", "0.5", "0.7", "0.9", "1.1"]
+    experiment = start_run(tmp_path, "--seeds", "0", "1", "2", "3", "4", "--hparams.delta", *deltas, "--hparams.gamma", "0.9")
+    lanes = experiment.lanes
+    assert len(lanes) == 35
+    assert lanes[6].index == {"seed": 1, "delta": 0.1}
+    assert lanes[6].name == "seed 1, delta 0.1"
+    assert lanes[6].hparams == HParams(delta=0.1, gamma=0.9)
+    assert settings.load(tmp_path) == experiment
+    assert settings.parse(["--run-dir", str(tmp_path), "--resume"])[0] == experiment
+    with pytest.raises(UsageError, match=r"hparams.delta \(saved \(-0.1, .*, asked 0.5\)"):
+        settings.parse(["--run-dir", str(tmp_path), "--resume", "--hparams.delta", "0.5"])
+
+
+def test_rows_of_a_sweep_are_told_apart_by_their_columns(tmp_path):
+    run = RunDir.create(tmp_path / "run", {}, None)
+    lanes = [lane.index for lane in Experiment(seeds=(4, 2), hparams=HParams(delta=(0.1, 0.3))).lanes]
+    for step in (100, 200):
+        run.append_metrics(step, 0.5, lanes, {"target_return": np.float32([1, 2, 3, 4]) * step})
+    assert (run.path / "metrics.csv").read_text().startswith("seed,delta,env_steps,wall_seconds,target_return\n")
+    read = run_dir.read_settings(run.path)
+    assert list(read) == ["delta 0.1", "delta 0.3"]
+    env_steps, curves = read["delta 0.3"]
+    assert env_steps.tolist() == [100, 200]
+    np.testing.assert_array_equal(curves["seed"][:, 0], [4, 2])
+    np.testing.assert_array_equal(curves["target_return"], [[300, 600], [400, 800]])
 
 
 def test_a_run_is_never_overwritten(tmp_path):
@@ -126,7 +158,7 @@ def test_metrics_cut_off_anywhere_are_read_up_to_the_last_evaluation_of_all_seed
     with pytest.raises(UsageError, match="no evaluation yet"):
         run_dir.read_metrics(run.path)
     for step in (100, 200):
-        run.append_metrics(step, 0.5, [4, 2], {"target_return": np.float32([0.25, -0.25])})
+        run.append_metrics(step, 0.5, [{"seed": 4}, {"seed": 2}], {"target_return": np.float32([0.25, -0.25])})
     whole = (run.path / "metrics.csv").read_text()
     second = whole.index("4,200")
     (run.path / "metrics.csv").write_text(whole[: second + min(kept, len(whole) - second - 1)])
@@ -138,7 +170,7 @@ def test_metrics_cut_off_anywhere_are_read_up_to_the_last_evaluation_of_all_seed
 def test_rewinding_drops_what_came_after_the_checkpoint(tmp_path):
     run = RunDir.create(tmp_path / "run", {}, None)
     for step in (100, 200, 300):
-        run.append_metrics(step, step / 10, [4, 2], {"target_return": np.float32([step, -step]) / 7})
+        run.append_metrics(step, step / 10, [{"seed": 4}, {"seed": 2}], {"target_return": np.float32([step, -step]) / 7})
         run.write_tasks(step, {"xy": np.zeros((2, 8, 3), np.float32)})
     run.rewind(200)
     env_steps, curves = run_dir.read_metrics(run.path)
@@ -158,7 +190,7 @@ def test_a_missing_sink_names_its_extra(monkeypatch):
 
 
 def test_tensorboard_writes_events(tmp_path):
-    (sink,) = sinks.make_sinks(["tensorboard"], tmp_path, start=0, seeds=(0,), config={})
+    (sink,) = sinks.make_sinks(["tensorboard"], tmp_path, start=0, lanes=Experiment(seeds=(0,)).lanes, config={})
     sink.write(100, {"beta": np.float32([1.0])})
     sink.close()
     assert list((tmp_path / "tensorboard").glob("events*"))
@@ -194,7 +226,7 @@ def test_an_interrupted_run_resumes_as_if_nothing_happened(tmp_path, capsys):
     assert rows_without_time(run) == rows_without_time(tmp_path / "whole")
     assert len(rows_without_time(run)) == 3 * 10
     summary = json.loads((run / "summary.json").read_text())
-    assert list(summary["seeds"]) == ["3", "0", "5"]
+    assert [lane["seed"] for lane in summary["lanes"]] == [3, 0, 5]
     for name in ("learning_curves.png", "progression.png", "policy.gif", "tasks/seed_3.png"):
         assert (run / name).stat().st_size > 1000
 

@@ -14,6 +14,7 @@ import envs
 from apt_jax import checkpoint
 from apt_jax.config import PRESETS, Config, HParams
 from apt_jax.lanes import make_program, stack_hparams
+from apt_jax.methods import METHODS, Method, parse_method
 from apt_jax.trainer import Clock, diversity, make_trainer
 from tests.corridor import Corridor
 
@@ -34,10 +35,13 @@ CONFIG = Config(
     eval_episodes=2,
     probe_tasks=8,
     return_window=10,
+    alp_window=8,
+    alp_history=16,
+    alp_fit_every=20,
+    goal_tasks=8,
 )
 SWITCHES = {"relative_progress": True, "blank_bias": 2.0, "success_share": 0.5, "value_ensemble": 2}
 """What preset "fast" has beyond the paper."""
-METHODS = ("apt_gen", "random", "target_only")
 
 
 def config(method: str, **changes) -> Config:
@@ -80,13 +84,13 @@ def test_every_preset_makes_a_trainer(preset):
     make_trainer(envs.make("grid_world"), envs.load_target("grid_world", "A"), PRESETS[preset][0])
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [*METHODS, "apt_gen+rnd"])
 def test_metrics_are_finite_and_the_clock_counts_every_source(method):
     """With everything switched on; the other tests run the paper's form."""
     _, hparams = PRESETS["fast"]
     _, clock, history = run(config(method, **SWITCHES), [0, 1], hparams=[hparams] * 2)
     assert clock.env_steps == 180
-    assert clock.iteration == (90 if method == "target_only" else 45)
+    assert clock.iteration == (90 if parse_method(method).curriculum == "none" else 45)
     for metrics in history:
         for name, value in metrics.items():
             assert value.shape == (2,), name
@@ -117,6 +121,55 @@ def test_a_seed_alone_equals_the_same_seed_among_others(layout):
         assert_lane_equal(several, lane, alone)
 
 
+@pytest.mark.parametrize("method", ["alp_gmm", "goal_gan", "icm", "rnd", "ride"])
+def test_a_seed_of_another_method_alone_equals_the_same_seed_beside_one(method):
+    _, hparams = PRESETS["fast"]
+    several, _, _ = run(config(method, **SWITCHES), [0, 1], hparams=[hparams] * 2)
+    alone, _, _ = run(config(method, **SWITCHES), [1], hparams=[hparams])
+    assert_lane_equal(several, 1, alone)
+
+
+def test_lanes_may_be_laid_out_in_groups():
+    """Five lanes on two devices, two at once on each."""
+    trainer = make_trainer(SPACE, TARGET, config("dqn"))
+    lanes = stack_hparams([HParams()] * 5)
+
+    def states(**options):
+        compiled = make_program(trainer, 5, layout="vmap", **options)
+        keys = jax.vmap(jax.random.key)(np.arange(5))
+        return compiled.warmup(compiled.init(keys, lanes), Clock.start(), lanes)[0]
+
+    for a, b in zip(leaves(states(at_once=2)), leaves(states()), strict=True):
+        np.testing.assert_allclose(a[:5], b[:5], rtol=1e-4, atol=1e-5)
+    with pytest.raises(ValueError, match="at least one lane and one at once, got 5 and 0"):
+        make_program(trainer, 5, at_once=0)
+
+
+def test_a_method_is_a_curriculum_and_a_bonus():
+    assert parse_method("dqn") == Method("none", "none")
+    assert parse_method("apt_gen+rnd") == Method("apt_gen", "rnd")
+    assert parse_method("dqn+icm") == parse_method("icm")
+
+
+def test_goal_gans_tasks_are_played_twice():
+    """Consecutive episodes of an environment share their task, and then it changes."""
+    states, _, _ = run(config("goal_gan", **SWITCHES), [0, 1])
+    count = int(states.replay.finished[0, 1])
+    episodes = jax.tree.map(lambda x: np.asarray(x[0, 1, :count]), states.replay.episodes)
+    for env in range(2):
+        goals = episodes.w["goal"][episodes.env == env, 0]
+        assert len(goals) >= 4
+        np.testing.assert_array_equal(goals[0 : len(goals) // 2 * 2 : 2], goals[1 : len(goals) // 2 * 2 : 2])
+        assert (goals[2::2] != goals[1:-1:2]).all()
+
+
+def test_a_bonus_widens_the_clip_to_its_own_returns():
+    """RIDE's scale is large: what is trained on is worth more than the environment pays, and bounds the next values."""
+    states, _, _ = run(config("ride", **SWITCHES), [0, 1], hparams=[HParams(ride_scale=10.0)] * 2)
+    assert states.bonus.stream.returns.high[0] > 1.0 >= states.replay.returns.high[0]
+    assert states.replay.transitions.note.shape == states.replay.transitions.reward.shape
+
+
 def test_hyper_parameter_lanes_equal_separate_runs():
     lanes = [HParams(delta=0.1, gamma=0.9), HParams(delta=0.9, gamma=0.5)]
     several, _, _ = run(config("apt_gen"), [1, 1], hparams=lanes, layout="vmap")
@@ -133,9 +186,12 @@ def test_seeds_differ():
     assert all(not np.array_equal(k[0], k[1]) for k in kernels)
 
 
-def test_nothing_compiles_after_the_first_chunk():
+@pytest.mark.parametrize(
+    ("method", "switches"), [("apt_gen", {}), ("alp_gmm", SWITCHES), ("goal_gan", SWITCHES), ("ride", SWITCHES)]
+)
+def test_nothing_compiles_after_the_first_chunk(method, switches):
     """Neither in a longer run, nor for other seeds or hyper-parameters."""
-    cfg = config("apt_gen")
+    cfg = config(method, **switches)
     run(cfg, [0, 1], chunks=1)
     compiled = []
     jax.monitoring.register_event_duration_secs_listener(
@@ -179,8 +235,8 @@ def test_the_final_observation_is_stored_not_the_reset_one():
     assert (steps.next_obs["offset"][ended] == 0).all()
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_every_method_learns_a_shorter_corridor(method):
+@pytest.mark.parametrize("method", ["apt_gen", "random", "dqn"])
+def test_methods_learn_a_shorter_corridor(method):
     """Five tiles away: the shortest way pays 0.96, and nothing else more than 0.94."""
     cfg = config(
         method, warmup_steps=400, updates_per_step=2, batch_size=64, replay_steps=2000, refresh_every=100, eval_every=400
@@ -214,6 +270,9 @@ def test_resuming_from_a_checkpoint_equals_never_having_stopped(tmp_path, stop):
     ("changes", "words"),
     [
         ({"method": "apt-gen"}, "unknown method 'apt-gen'; closest is 'apt_gen'"),
+        ({"method": "rnd+icm"}, "has two bonuses"),
+        ({"method": "dqn+rdn"}, "unknown bonus 'rdn'; closest is 'rnd'"),
+        ({"method": "rnd", "n_step": 2}, "n_step must be 1 with the bonus 'rnd'"),
         ({"batch_size": 15}, "batch_size .* 2 sources, got 15"),
         ({"eval_every": 44}, "eval_every must be a multiple of refresh_every=20, got 44"),
         ({"eval_every": 50}, "eval_every .* 4 environment steps"),
