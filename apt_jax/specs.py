@@ -1,6 +1,6 @@
 """Named modalities of observations and task parameters.
 
-A *spec* is a mapping from a modality's name to its `Vector` or `Grid`.  Observations and task parameters `w` are dicts of
+A *spec* is a mapping from a modality's name to its `Vector`, `Grid` or `Table`.  Observations and task parameters `w` are dicts of
 arrays with the same names.  Networks are built from specs alone, so a new task space needs no network code.
 """
 
@@ -54,7 +54,23 @@ class Grid:
             raise ValueError(f"Grid needs height, width >= 1 and categories >= 2, got {self}")
 
 
-Modality: TypeAlias = Vector | Grid
+@dataclass(frozen=True)
+class Table:
+    """`rows` independent choices among `categories` that lie on no board, such as the place of each of several objects.
+
+    As an observation: uint8 indices [rows].  As a task parameter: float32 scores [rows, categories] of which the task space takes
+    the argmax.  No category stands out.
+    """
+
+    rows: int
+    categories: int
+
+    def __post_init__(self) -> None:
+        if self.rows < 1 or self.categories < 2:
+            raise ValueError(f"Table needs rows >= 1 and categories >= 2, got {self}")
+
+
+Modality: TypeAlias = Vector | Grid | Table
 Spec: TypeAlias = Mapping[str, Modality]
 Obs: TypeAlias = dict[str, Array]
 Params: TypeAlias = dict[str, Array]
@@ -69,6 +85,8 @@ def obs_struct(spec: Spec) -> dict[str, jax.ShapeDtypeStruct]:
                 return jax.ShapeDtypeStruct((modality.size,), jnp.dtype(modality.dtype))
             case Grid():
                 return jax.ShapeDtypeStruct((modality.height, modality.width), jnp.uint8)
+            case Table():
+                return jax.ShapeDtypeStruct((modality.rows,), jnp.uint8)
 
     return {name: struct(modality) for name, modality in spec.items()}
 
@@ -82,6 +100,8 @@ def param_struct(spec: Spec) -> dict[str, jax.ShapeDtypeStruct]:
                 return jax.ShapeDtypeStruct((modality.size,), jnp.float32)
             case Grid():
                 return jax.ShapeDtypeStruct((modality.height, modality.width, modality.categories), jnp.float32)
+            case Table():
+                return jax.ShapeDtypeStruct((modality.rows, modality.categories), jnp.float32)
 
     return {name: struct(modality) for name, modality in spec.items()}
 
