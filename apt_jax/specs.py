@@ -1,7 +1,7 @@
 """Named modalities of observations and task parameters.
 
-A *spec* is a mapping from a modality's name to its `Vector`, `Grid` or `Table`.  Observations and task parameters `w` are dicts of
-arrays with the same names.  Networks are built from specs alone, so a new task space needs no network code.
+A *spec* is a mapping from a modality's name to its `Vector`, `Grid` or `Table`.  Observations and task parameters `w` are
+dicts of arrays with the same names.  Networks are built from specs alone, so a new task space needs no network code.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class Grid:
 class Table:
     """`rows` independent choices among `categories` that lie on no board, such as the place of each of several objects.
 
-    As an observation: uint8 indices [rows].  As a task parameter: float32 scores [rows, categories] of which the task space takes
-    the argmax.  No category stands out.
+    As an observation: uint8 indices [rows].  As a task parameter: float32 scores [rows, categories] of which the task space
+    takes the argmax.  No category stands out.
     """
 
     rows: int

@@ -342,8 +342,8 @@ def check_target(space: TaskSpace, target: Any) -> None:
 def diversity(spec: Spec, w: Params) -> Metrics:
     """How much proposed tasks differ (leaves [n, ...]), per modality.
 
-    `probe_entropy_*` of a grid or table: mean entropy of a category over tasks, as a share of the largest.  `probe_spread_*` of a
-    vector: mean standard deviation of a number over tasks, as a share of its range.
+    `probe_entropy_*` of a grid or table: mean entropy of a category over tasks, as a share of the largest.
+    `probe_spread_*` of a vector: mean standard deviation of a number over tasks, as a share of its range.
     """
 
     def entropy(scores: Array, categories: int) -> Array:

@@ -17,8 +17,8 @@ CHANNELS = 16
 MERGE_SIZE = 128
 
 Features: TypeAlias = dict[str, Float[Array, "..."]]
-"""Per modality: a Vector's numbers in [-1, 1], shape [..., size]; a Grid's channels, shape [..., h, w, categories]; a Table's rows
-side by side, shape [..., rows * categories]."""
+"""Per modality: a Vector's numbers in [-1, 1], shape [..., size]; a Grid's channels, shape [..., h, w, categories]; a
+Table's rows side by side, shape [..., rows * categories]."""
 
 
 def observation_features(spec: Spec, obs: Obs) -> Features:

@@ -79,8 +79,8 @@ def stream(
 class GridHead(nn.Module):
     """A `stream`, a convolution, a softmax: [batch, hidden] -> [batch, h, w, c].
 
-    The scores are normalised cell by cell, over the batch alone: over cells too, one board could have all the variance within it
-    and be the same for every z.
+    The scores are normalised cell by cell, over the batch alone: over cells too, one board could have all the variance
+    within it and be the same for every z.
     """
 
     grid: Grid
@@ -99,7 +99,8 @@ class GridHead(nn.Module):
 
 
 class TableHead(nn.Module):
-    """A `stream` over rows by categories, a convolution to one score each, a softmax: [batch, hidden] -> [batch, rows, categories].
+    """A `stream` over rows by categories, a convolution to one score each, a softmax: [batch, hidden] -> [batch, rows,
+    categories].
 
     The paper makes "grid and table" in the same way.  Scores are normalised one by one, as a grid's are cell by cell.
     """

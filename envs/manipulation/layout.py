@@ -70,8 +70,8 @@ def parse_table(text: str) -> Task:
 
     Raises:
       ValueError: with line and column (both from 1) of an unknown word or character, of what is no number, too many or
-        out of range; if a can does not stand on the surface, or within an obstacle or another can; or if the first can, the range or
-        rows are missing.
+        out of range; if a can does not stand on the surface, or within an obstacle or another can; or if the first can, the
+        range or rows are missing.
     """
     lines = [(number, line.rstrip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
     rows = [(number, line) for number, line in lines if line.split()[0] not in NUMBERS]

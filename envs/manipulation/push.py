@@ -1,11 +1,12 @@
 """One push of a can on a table, simulated until the can has come to rest or the first event.
 
-An event is a fall (off the table or into a hole) or a hit (of an obstacle or another can).  The physics knows the can, the tool and
-the ground; whether the can meets anything else is geometry.  The pose is frozen at the first event.
+An event is a fall (off the table or into a hole) or a hit (of an obstacle or another can).  The physics knows the can, the
+tool and the ground; whether the can meets anything else is geometry.  The pose is frozen at the first event.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -114,8 +115,8 @@ def at_rest() -> Motion:
     return Motion(jnp.asarray(qpos), zeros, zeros, jnp.int32(0), no, no)
 
 
-def simulate(motion: Motion, supported) -> Motion:
-    """One time step of MJX with the tool where it has to be."""
+def simulate(motion: Motion, supported: Callable[[Float[Array, "feet 3"]], Bool[Array, "feet"]]) -> Motion:
+    """One time step of MJX with the tool where it has to be; `supported` says which feet have ground under them."""
     scene = push_model()
     model, data = jax.tree.map(jnp.asarray, (scene.model, scene.data))
     place, speed = stroke(motion.steps.astype(jnp.float32) * TIMESTEP)

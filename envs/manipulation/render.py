@@ -23,6 +23,7 @@ SAMPLES = 3
 LINE = 0.006
 """Metres: width of rims and rings."""
 
+Color = tuple[int, int, int] | Float[np.ndarray, "3"]
 Image = Float[np.ndarray, "height width 3"]
 Mask = Bool[np.ndarray, "height width"]
 Points = Float[np.ndarray, "height width 2"]
@@ -48,7 +49,7 @@ def render(task: Task, state: State | None = None, *, tile_size: int = 32) -> UI
     image = np.where(task.ground[cells[..., 0], cells[..., 1], None], np.array(SURFACE, float), np.array(HOLE, float))
     seam = np.abs((points + BLOCK / 2) % BLOCK - BLOCK / 2).min(axis=-1) < LINE / 4
     image = _paint(image, seam & task.ground[cells[..., 0], cells[..., 1]], SEAM)
-    image = _goal(image, points, goal, float(task.goal_range))
+    image = _goal(image, points, np.asarray(goal), float(task.goal_range))
     image = _obstacles(image, points, task.obstacles)
     for place, present, color in zip(cans, task.present, CAN_COLORS, strict=True):
         if present:
@@ -58,7 +59,7 @@ def render(task: Task, state: State | None = None, *, tile_size: int = 32) -> UI
     return samples.mean(axis=(1, 3)).round().astype(np.uint8)
 
 
-def _paint(image: Image, mask: Mask, color: tuple[int, int, int]) -> Image:
+def _paint(image: Image, mask: Mask, color: Color) -> Image:
     return np.where(mask[..., None], np.array(color, float), image)
 
 
@@ -80,6 +81,6 @@ def _obstacles(image: Image, points: Points, obstacles: Obstacles) -> Image:
         across = np.abs(offset @ np.array([-axis[1], axis[0]])) - half[1]
         outside = np.hypot(np.maximum(along, 0), np.maximum(across, 0)) + np.minimum(np.maximum(along, across), 0)
         share = np.clip((height / ROADBLOCK_HEIGHT - 1) / 2, 0, 1)
-        color = tuple(int(low + share * (high - low)) for low, high in zip(LOW, HIGH, strict=True))
+        color = (1 - share) * np.array(LOW) + share * np.array(HIGH)
         image = _paint(_paint(image, outside <= rounding, RIM), outside <= rounding - LINE / 2, color)
     return image

@@ -1,13 +1,13 @@
 """What a push is simulated with: one can and one tool in the frame of the push, for MuJoCo and for MJX.
 
-The push goes along +x and the can starts at the origin, so that one model serves every action of every task.  Only the pushed can
-ever moves: an episode ends as soon as it meets anything else.
+The push goes along +x and the can starts at the origin, so that one model serves every action of every task.  Only the
+pushed can ever moves: an episode ends as soon as it meets anything else.
 
 MJX has no contacts of cylinders with boxes, and contacts with friction hop at the time step that a cheap push needs: a sliding
 contact's friction lifts the can.  Hence two replacements, which `table_scene` does without:
 
-* The can stands on small spheres, which meet one infinite floor; where there is no ground under a sphere its contact is switched
-  off.
+* The can stands on small spheres, which meet one infinite floor; where there is no ground under a sphere its contact is
+  switched off.
 * Contacts have no friction.  The friction of the can's base is that of the joints which carry the base along x and y.
 """
 
@@ -47,7 +47,7 @@ class Model(NamedTuple):
     """The scene of a push, as MJX has it; leaves are numpy arrays.
 
     Attributes:
-      step: `step(model, data) -> data`, MJX's.
+      step: `step(model, data) -> data`, MJX's, jitted.
       model: the `mjx.Model`.
       data: an `mjx.Data` to replace fields of.
       feet: the spheres' centres relative to that of the can's base, in the order of their contact pairs.
@@ -64,9 +64,9 @@ class Model(NamedTuple):
 def feet() -> Float[np.ndarray, "feet 3"]:
     """Centres of the can's feet relative to that of its base: four close to its axis, four on the rim, two between ahead.
 
-    The four inside stand for the centre: a can whose centre has ground about it stands firm.  The four on the rim lie on the axes
-    of the push, so that what tips a can over an edge is as far from its centre as the rim.  The two ahead hold a can that brakes
-    with its front over an edge, or one whose axis is just beside a corner.
+    The four inside stand for the centre: a can whose centre has ground about it stands firm.  The four on the rim lie on
+    the axes of the push, so that what tips a can over an edge is as far from its centre as the rim.  The two ahead hold a
+    can that brakes with its front over an edge, or one whose axis is just beside a corner.
     """
     rim = CAN_RADIUS - FOOT_RADIUS
     axes = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)]
@@ -138,7 +138,8 @@ def push_model() -> Model:
     with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         put = mjx.put_model(model, impl="jax")
         put, data = jax.tree.map(np.asarray, (put, mjx.make_data(put)))
-    return Model(mjx.step, put, data, feet(), model.npair)
+    # Jitted, because tracing it takes seconds: so it is traced once, however many programs push cans.
+    return Model(jax.jit(mjx.step), put, data, feet(), model.npair)
 
 
 def _numbers(values: Iterable[float]) -> str:

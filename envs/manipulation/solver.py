@@ -1,7 +1,7 @@
 """Shortest solutions by breadth-first search over the places that pushes take the cans to.
 
-Each can is first pushed about alone, in the simulation: that gives the places it can reach and the pushes between them.  The search
-then runs over places of all cans at once, where a push must stay clear of the other cans.
+Each can is first pushed about alone, in the simulation: that gives the places it can reach and the pushes between them.
+The search then runs over places of all cans at once, where a push must stay clear of the other cans.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Roads(NamedTuple):
 def solve(task: Task, jitter: float = 0.0) -> list[int] | None:
     """Actions of a shortest solution, wherever the goal's centre is drawn within `jitter` along x and y; on the host.
 
-    None if there is none within the horizon that keeps `SPARE` from other cans.  The search takes places to be exact that are so to
-    `SAME_PLACE`: replay a solution before relying on it.
+    None if there is none within the horizon that keeps `SPARE` from other cans.  The search takes places to be exact that
+    are so to `SAME_PLACE`: replay a solution before relying on it.
     """
     task = jax.device_get(task)
     if not task.present[TARGET]:

@@ -64,10 +64,10 @@ class Space:
     def describe(self, task: Task, target: Task) -> dict[str, Float[Array, ""]]:
         """What a task is built of and how far it is from the target; whether it can be solved would take thousands of pushes.
 
-        `cans`: how many appear.  `target_can`: 1 if the one to be pushed does, else 0.  `pits`, `roadblocks`: shares of the blocks,
-        in [0, 1], by the height of their centres.  `goal_range`: r2 in metres.  `goal_way`: metres from the can to be pushed to the
-        goal, NaN if it is absent.  `block_distance`: share of the blocks whose height is not the target's.  `can_distance`: mean
-        metres between a can's places in both, over cans that are in both; NaN if none is.
+        `cans`: how many appear.  `target_can`: 1 if the one to be pushed does, else 0.  `pits`, `roadblocks`: shares of the
+        blocks, in [0, 1], by the height of their centres.  `goal_range`: r2 in metres.  `goal_way`: metres from the can to be
+        pushed to the goal, NaN if it is absent.  `block_distance`: share of the blocks whose height is not the target's.
+        `can_distance`: mean metres between a can's places in both, over cans that are in both; NaN if none is.
         """
         heights, wanted = (landscape(table, jnp.asarray(centers())) for table in (task, target))
         both = task.present & target.present

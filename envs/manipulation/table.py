@@ -1,7 +1,7 @@
 """The table: its sizes, what stands on it, and the task they make up.
 
-Lengths are in metres.  x runs along the table's 90 cm from the left, y along its 60 cm away from the robot, both as seen by someone
-who faces the robot; z is the height above the table's surface.
+Lengths are in metres.  x runs along the table's 90 cm from the left, y along its 60 cm away from the robot, both as seen by
+someone who faces the robot; z is the height above the table's surface.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ def table_xml(task: Task, cans: Float[np.ndarray, "3 2"], tool_pose: tuple[float
   <option timestep="{TIMESTEP}" gravity="0 0 {-GRAVITY}"/>
   <default><geom solref="0.01 1" friction="{FRICTION} .005 .0001"/></default>
   <worldbody>
-    {"".join(_ground(task.ground))}
+    {"".join(_ground(np.asarray(task.ground)))}
     {"".join(_obstacles(task))}
     {"".join(bodies)}
     {_tool(*tool_pose) if tool_pose else ""}
@@ -60,7 +60,7 @@ def _tool(x: float, y: float, angle: float) -> str:
 
 def _ground(ground: Bool[np.ndarray, "36 24"]) -> Iterator[str]:
     """Boxes under the surface, as few as cover each cell once: equal runs of cells side by side are one box."""
-    width, depth = ground.shape
+    width = len(ground)
     open_runs: dict[tuple[int, int], int] = {}
     for column in range(width + 1):
         runs = set(_runs(ground[column])) if column < width else set()
