@@ -51,13 +51,18 @@ def _step():
     return jax.jit(SPACE.step)
 
 
-def play(task, actions, goal=None):
-    """The step outputs of (can, direction) pairs from the start of an episode whose goal is the task's, or `goal` in metres."""
+def play(task, actions, goal=None, *, whole=True):
+    """The step outputs of (can, direction) pairs from the start of an episode whose goal is the task's, or `goal` in metres.
+
+    Pushes beyond the end of the episode are a mistake, unless it need not be the `whole` plan.
+    """
     state, _ = SPACE.reset(jax.random.key(0), task)
     state = state._replace(goal=jnp.asarray(task.goal if goal is None else goal, jnp.float32))
     outs = []
     for can, direction in actions:
-        assert not (outs and (outs[-1].terminated or outs[-1].truncated)), "the episode is over"
+        if outs and (outs[-1].terminated or outs[-1].truncated):
+            assert not whole, "the episode is over"
+            break
         outs.append(_step()(state, jnp.int32(4 * can + direction), task))
         state = outs[-1].state
     return outs
