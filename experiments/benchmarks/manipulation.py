@@ -91,8 +91,9 @@ def random_pushes(key: Key[Array, ""], n: int) -> tuple[Any, Any, Array]:
     space = envs.make("manipulation")
     key_w, key_reset, key_action = jax.random.split(key, 3)
     w = jax.vmap(space.sample_uniform)(jax.random.split(key_w, n))
-    chosen = jax.nn.one_hot(jnp.argmax(w["placement"][:, 0], axis=-1), w["placement"].shape[-1]).reshape(n,
-    *w["blocks"].shape[1:3]) tasks = jax.vmap(space.instantiate)({**w, "blocks": w["blocks"].at[..., 0].add(chosen)})
+    first = w["placement"][:, 0]
+    flat = jax.nn.one_hot(jnp.argmax(first, axis=-1), first.shape[-1]).reshape(w["blocks"].shape[:-1])
+    tasks = jax.vmap(space.instantiate)({**w, "blocks": w["blocks"].at[..., 0].add(flat)})
     states, _ = jax.vmap(space.reset)(jax.random.split(key_reset, n), tasks)
     return tasks, states, jax.random.randint(key_action, (n,), 0, len(DIRECTIONS))
 
