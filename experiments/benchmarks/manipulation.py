@@ -52,7 +52,8 @@ class Args(Options):
 @dataclass(frozen=True)
 class Side:
     """Environments side by side: the time of one push of all of them, and the process's largest resident size after it, in
-    bytes."""
+    bytes.
+    """
 
     timing: Timing
     peak_memory: int
@@ -136,10 +137,7 @@ def time_same_model(args: Args) -> Timing:
 def time_true_shapes(args: Args) -> Timing:
     """Cylinders, boxes and all blocks of random tables, each pushed once for as long as a push of ours lasts."""
     tasks, _, directions = jax.device_get(random_pushes(jax.random.key(0), args.true_pushes))
-    scenes = [
-        _true_scene(jax.tree.map(lambda leaf, i=i: leaf[i], tasks), int(directions[i]))  # type: ignore[misc]
-        for i in range(args.true_pushes)
-    ]
+    scenes = [_true_scene(jax.tree.map(lambda leaf, i=i: leaf[i], tasks), int(directions[i])) for i in range(args.true_pushes)]
 
     def run() -> float:
         began = time.perf_counter()
