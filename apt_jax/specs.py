@@ -1,7 +1,7 @@
 """Named modalities of observations and task parameters.
 
-A *spec* is a mapping from a modality's name to its `Vector` or `Grid`.  Observations and task parameters `w` are dicts of
-arrays with the same names.  Networks are built from specs alone, so a new task space needs no network code.
+A *spec* is a mapping from a modality's name to its `Vector`, `Grid` or `Table`.  Observations and task parameters `w` are
+dicts of arrays with the same names.  Networks are built from specs alone, so a new task space needs no network code.
 """
 
 from __future__ import annotations
@@ -55,7 +55,23 @@ class Grid:
             raise ValueError(f"Grid needs height, width >= 1 and categories >= 2, got {self}")
 
 
-Modality: TypeAlias = Vector | Grid
+@dataclass(frozen=True)
+class Table:
+    """`rows` independent choices among `categories` that lie on no board, such as the place of each of several objects.
+
+    As an observation: uint8 indices [rows].  As a task parameter: float32 scores [rows, categories] of which the task space
+    takes the argmax.  No category stands out.
+    """
+
+    rows: int
+    categories: int
+
+    def __post_init__(self) -> None:
+        if self.rows < 1 or self.categories < 2:
+            raise ValueError(f"Table needs rows >= 1 and categories >= 2, got {self}")
+
+
+Modality: TypeAlias = Vector | Grid | Table
 Spec: TypeAlias = Mapping[str, Modality]
 Obs: TypeAlias = dict[str, Array]
 Params: TypeAlias = dict[str, Array]
@@ -70,6 +86,8 @@ def obs_struct(spec: Spec) -> dict[str, jax.ShapeDtypeStruct]:
                 return jax.ShapeDtypeStruct((modality.size,), jnp.dtype(modality.dtype))
             case Grid():
                 return jax.ShapeDtypeStruct((modality.height, modality.width), jnp.uint8)
+            case Table():
+                return jax.ShapeDtypeStruct((modality.rows,), jnp.uint8)
 
     return {name: struct(modality) for name, modality in spec.items()}
 
@@ -83,6 +101,8 @@ def param_struct(spec: Spec) -> dict[str, jax.ShapeDtypeStruct]:
                 return jax.ShapeDtypeStruct((modality.size,), jnp.float32)
             case Grid():
                 return jax.ShapeDtypeStruct((modality.height, modality.width, modality.categories), jnp.float32)
+            case Table():
+                return jax.ShapeDtypeStruct((modality.rows, modality.categories), jnp.float32)
 
     return {name: struct(modality) for name, modality in spec.items()}
 
@@ -96,6 +116,8 @@ def flatten(spec: Spec, w: Params) -> Float[Array, "*batch D"]:
                 return (w[name] - modality.low) / (modality.high - modality.low)
             case Grid():
                 return w[name].reshape(*w[name].shape[:-3], -1)
+            case Table():
+                return w[name].reshape(*w[name].shape[:-2], -1)
 
     return jnp.concatenate([block(name, modality) for name, modality in spec.items()], axis=-1)
 
@@ -104,7 +126,7 @@ def unflatten(spec: Spec, vector: Float[Array, "*batch D"]) -> Params:
     """The task parameter of any vector, brought into range without a change of its categories.
 
     Vectors are clipped.  Scores clipped one by one would tie above 1, and a tie goes to the first category; so the scores of a
-    cell that leave [0, 1] are moved and shrunk together, which keeps their order.
+    choice that leave [0, 1] are moved and shrunk together, which keeps their order.
     """
     struct = param_struct(spec)
     ends = np.cumsum([block.size for block in struct.values()])
@@ -113,7 +135,7 @@ def unflatten(spec: Spec, vector: Float[Array, "*batch D"]) -> Params:
         match modality:
             case Vector():
                 w[name] = modality.low + (modality.high - modality.low) * jnp.clip(block, 0.0, 1.0)
-            case Grid():
+            case Grid() | Table():
                 scores = block.reshape(*block.shape[:-1], *struct[name].shape)
                 scores = scores - jnp.minimum(jnp.min(scores, axis=-1, keepdims=True), 0.0)
                 w[name] = scores / jnp.maximum(jnp.max(scores, axis=-1, keepdims=True), 1.0)

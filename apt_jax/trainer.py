@@ -24,7 +24,7 @@ from apt_jax.config import Config, HParams
 from apt_jax.curricula.base import GENERATED, TARGET, Metrics, no_update
 from apt_jax.methods import make_method
 from apt_jax.networks import QNetwork
-from apt_jax.specs import Grid, Obs, Params, Spec, Vector, param_struct
+from apt_jax.specs import Grid, Obs, Params, Spec, Table, Vector, param_struct
 from apt_jax.task_space import TaskSpace
 
 _REFRESH_STREAM = 1_000_033
@@ -365,8 +365,8 @@ def check_target(space: TaskSpace, target: Any) -> None:
 def diversity(spec: Spec, w: Params) -> Metrics:
     """How much proposed tasks differ (leaves [n, ...]), per modality.
 
-    `probe_entropy_*` of a grid: mean entropy of a cell's category over tasks, as a share of the largest.  `probe_spread_*` of a
-    vector: mean standard deviation of a number over tasks, as a share of its range.
+    `probe_entropy_*` of a grid or table: mean entropy of a category over tasks, as a share of the largest.
+    `probe_spread_*` of a vector: mean standard deviation of a number over tasks, as a share of its range.
     """
 
     def entropy(scores: Array, categories: int) -> Array:
@@ -376,7 +376,7 @@ def diversity(spec: Spec, w: Params) -> Metrics:
     metrics = {}
     for name, modality in spec.items():
         match modality:
-            case Grid():
+            case Grid() | Table():
                 metrics[f"probe_entropy_{name}"] = entropy(w[name], modality.categories)
             case Vector():
                 metrics[f"probe_spread_{name}"] = jnp.mean(jnp.std(w[name], axis=0)) / (modality.high - modality.low)

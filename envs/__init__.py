@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 
 from apt_jax.registry import look_up
 from apt_jax.task_space import TaskSpace
-from envs import grid_world
+from envs import grid_world, manipulation
 
 
 class BenchmarkSpace(TaskSpace, Protocol):
@@ -37,6 +37,7 @@ class BenchmarkSpace(TaskSpace, Protocol):
 
 SPACES: Mapping[str, Callable[[], BenchmarkSpace]] = {
     "grid_world": grid_world.Space,
+    "manipulation": manipulation.Space,
 }
 """Constructor of each task space by name."""
 

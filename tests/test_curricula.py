@@ -18,10 +18,10 @@ from apt_jax import replay as rp
 from apt_jax.config import Config, HParams
 from apt_jax.curricula import CURRICULA, alp_gmm, goal_gan
 from apt_jax.curricula.base import GENERATED
-from apt_jax.specs import Grid, Vector, block_weights, flatten, unflatten
+from apt_jax.specs import Grid, Table, Vector, block_weights, flatten, unflatten
 from tests.corridor import Corridor
 
-SPEC = {"tiles": Grid(2, 2, 3), "xy": Vector(2, 0, 10)}
+SPEC = {"tiles": Grid(2, 2, 3), "xy": Vector(2, 0, 10), "place": Table(2, 4)}
 
 
 def progress(w, returns, window=None):
@@ -70,26 +70,29 @@ def test_components_are_drawn_by_their_progress():
 
 
 def test_flattening_is_undone_and_blocks_weigh_alike():
-    w = {"tiles": jax.random.uniform(jax.random.key(0), (5, 2, 2, 3)), "xy": jnp.full((5, 2), 7.5)}
+    scores = {"tiles": (5, 2, 2, 3), "place": (5, 2, 4)}
+    w = {name: jax.random.uniform(jax.random.key(len(shape)), shape) for name, shape in scores.items()}
+    w["xy"] = jnp.full((5, 2), 7.5)
     vector = flatten(SPEC, w)
-    np.testing.assert_allclose(vector[:, 12:], 0.75)
+    np.testing.assert_allclose(vector[:, 12:14], 0.75)
     for name, block in unflatten(SPEC, vector).items():
         np.testing.assert_allclose(block, w[name], rtol=1e-6)
     weights = block_weights(SPEC)
-    np.testing.assert_allclose([np.sum(weights[:12] ** 2), np.sum(weights[12:] ** 2)], 1.0, rtol=1e-6)
+    np.testing.assert_allclose([np.sum(block**2) for block in np.split(weights, [12, 14])], 1.0, rtol=1e-6)
 
 
 def test_vectors_out_of_range_keep_their_categories():
     """Clipping each score first would favour the first category, .412 to .268."""
-    vector = 0.5 + jax.random.normal(jax.random.key(1), (30_000, 14))
+    vector = 0.5 + jax.random.normal(jax.random.key(1), (30_000, 22))
     w = unflatten(SPEC, vector)
-    wanted = jnp.argmax(vector[:, :12].reshape(-1, 2, 2, 3), axis=-1)
-    np.testing.assert_array_equal(jnp.argmax(w["tiles"], axis=-1), wanted)
-    np.testing.assert_allclose(np.bincount(np.ravel(wanted)) / wanted.size, 1 / 3, atol=0.005)
-    for name, high in (("tiles", 1.0), ("xy", 10.0)):
+    for name, scores in (("tiles", vector[:, :12].reshape(-1, 2, 2, 3)), ("place", vector[:, 14:].reshape(-1, 2, 4))):
+        wanted = jnp.argmax(scores, axis=-1)
+        np.testing.assert_array_equal(jnp.argmax(w[name], axis=-1), wanted)
+        np.testing.assert_allclose(np.bincount(np.ravel(wanted)) / wanted.size, 1 / scores.shape[-1], atol=0.005)
+    for name, high in (("tiles", 1.0), ("place", 1.0), ("xy", 10.0)):
         assert w[name].min() >= 0
         assert w[name].max() <= high
-    np.testing.assert_array_equal(w["xy"], 10.0 * jnp.clip(vector[:, 12:], 0.0, 1.0))
+    np.testing.assert_array_equal(w["xy"], 10.0 * jnp.clip(vector[:, 12:14], 0.0, 1.0))
 
 
 def test_random_tasks_are_uniform():

@@ -16,7 +16,7 @@ from apt_jax.curricula.base import GENERATED, TARGET, Curriculum, Metrics
 from apt_jax.losses import adapt_beta
 from apt_jax.networks import init_singular_vectors, spectral_normalize
 from apt_jax.networks.apply import apply
-from apt_jax.specs import Grid, Params, Spec, obs_struct, param_struct, zeros_like
+from apt_jax.specs import Params, Spec, Vector, obs_struct, param_struct, zeros_like
 from apt_jax.task_space import TaskSpace
 
 
@@ -199,14 +199,14 @@ def explore(spec: Spec, w: Params, key: Key[Array, ""], hparams: HParams) -> Par
     for (name, modality), key_block in zip(spec.items(), jax.random.split(key, len(spec)), strict=True):
         block = w[name]
         key_noise, key_cell = jax.random.split(key_block)
-        if isinstance(modality, Grid):
-            scores = jax.random.uniform(key_noise, block.shape)
-            replaced = jax.random.uniform(key_cell, block.shape[:-1]) < hparams.cell_noise
-            explored[name] = jnp.where(replaced[..., None], scores, block)
-        else:
+        if isinstance(modality, Vector):
             spread = hparams.vector_noise * (modality.high - modality.low)
             noisy = block + spread * jax.random.normal(key_noise, block.shape)
             explored[name] = jnp.clip(noisy, modality.low, modality.high)
+        else:
+            scores = jax.random.uniform(key_noise, block.shape)
+            replaced = jax.random.uniform(key_cell, block.shape[:-1]) < hparams.cell_noise
+            explored[name] = jnp.where(replaced[..., None], scores, block)
     return explored
 
 

@@ -14,7 +14,7 @@ from apt_jax import replay as rp
 from apt_jax.config import Config, HParams
 from apt_jax.networks import Discriminator, Generator, ValueNetwork, pool, spectral_normalize
 from apt_jax.networks.apply import apply
-from apt_jax.specs import Grid, Params, Spec
+from apt_jax.specs import Params, Spec, Vector
 from apt_jax.task_space import TaskSpace
 
 
@@ -124,7 +124,7 @@ def as_instantiated(spec: Spec, w: Params) -> Params:
 
     def harden(name: str) -> Array:
         scores = w[name]
-        if not isinstance(spec[name], Grid):
+        if isinstance(spec[name], Vector):
             return scores
         one_hot = jax.nn.one_hot(jnp.argmax(scores, axis=-1), scores.shape[-1])
         return scores + jax.lax.stop_gradient(one_hot - scores)

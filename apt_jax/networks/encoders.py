@@ -10,18 +10,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from apt_jax.networks.layers import Conv
-from apt_jax.specs import Grid, Obs, Params, Spec, Vector
+from apt_jax.specs import Grid, Modality, Obs, Params, Spec, Table, Vector
 
 ENCODING_SIZE = 64
 CHANNELS = 16
 MERGE_SIZE = 128
 
 Features: TypeAlias = dict[str, Float[Array, "..."]]
-"""Per modality: a Vector's numbers in [-1, 1], shape [..., size]; a Grid's channels, shape [..., h, w, categories]."""
+"""Per modality: a Vector's numbers in [-1, 1], shape [..., size]; a Grid's channels, shape [..., h, w, categories]; a
+Table's rows side by side, shape [..., rows * categories]."""
 
 
 def observation_features(spec: Spec, obs: Obs) -> Features:
-    """What the networks see of an observation: vectors over their scale, grids one-hot."""
+    """What the networks see of an observation: vectors over their scale, grids and tables one-hot."""
     features = {}
     for name, modality in spec.items():
         match modality:
@@ -29,12 +30,29 @@ def observation_features(spec: Spec, obs: Obs) -> Features:
                 features[name] = obs[name].astype(jnp.float32) / modality.scale
             case Grid():
                 features[name] = jax.nn.one_hot(obs[name], modality.categories)
+            case Table():
+                features[name] = _flat(jax.nn.one_hot(obs[name], modality.categories))
     return features
 
 
 def parameter_features(spec: Spec, w: Params) -> Features:
-    """What the networks see of a task parameter: vectors over their scale, grid scores as they are."""
-    return {name: w[name] / block.scale if isinstance(block, Vector) else w[name] for name, block in spec.items()}
+    """What the networks see of a task parameter: vectors over their scale, scores as they are."""
+
+    def feature(modality: Modality, block: Array) -> Array:
+        match modality:
+            case Vector():
+                return block / modality.scale
+            case Grid():
+                return block
+            case Table():
+                return _flat(block)
+
+    return {name: feature(modality, w[name]) for name, modality in spec.items()}
+
+
+def _flat(rows: Float[Array, "*batch rows categories"]) -> Float[Array, "*batch flat"]:
+    """Rows side by side: their order carries no distance that a convolution could use."""
+    return rows.reshape(*rows.shape[:-2], -1)
 
 
 class GridStack(nn.Module):

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key
 
 from apt_jax.networks.encoders import CHANNELS, ENCODING_SIZE
 from apt_jax.networks.layers import Conv, ConvTranspose
-from apt_jax.specs import Grid, Params, Spec, Vector
+from apt_jax.specs import Grid, Params, Spec, Table, Vector
 
 
 class Generator(nn.Module):
@@ -45,6 +45,8 @@ class Generator(nn.Module):
                     w[name] = VectorHead(modality, norm, name=name)(hidden)
                 case Grid():
                     w[name] = GridHead(modality, self.blank_bias, norm, name=name)(hidden)
+                case Table():
+                    w[name] = TableHead(modality, norm, name=name)(hidden)
         return w
 
 
@@ -60,11 +62,25 @@ class VectorHead(nn.Module):
         return self.vector.low + (self.vector.high - self.vector.low) * nn.sigmoid(logits)
 
 
-class GridHead(nn.Module):
-    """Two transposed convolutions from a quarter of the board, a convolution, a softmax: [batch, hidden] -> [batch, h, w, c].
+def stream(
+    hidden: Float[Array, "batch hidden"], height: int, width: int, *, norm: partial[nn.BatchNorm]
+) -> Float[Array, "batch h w channels"]:
+    """Two transposed convolutions from a quarter of a board, inside the module that calls it.
 
-    Boards whose sides are no multiple of four are cut out of the next larger one.  The scores are normalised cell by cell, over
-    the batch alone: over cells too, one board could have all the variance within it and be the same for every z.
+    Boards whose sides are no multiple of four are cut out of the next larger one.
+    """
+    shape = (-(-height // 4), -(-width // 4), CHANNELS)
+    x = nn.relu(norm()(nn.Dense(prod(shape), use_bias=False)(hidden))).reshape(-1, *shape)
+    for _ in range(2):
+        x = nn.relu(norm()(ConvTranspose(CHANNELS)(x)))
+    return x[:, :height, :width]
+
+
+class GridHead(nn.Module):
+    """A `stream`, a convolution, a softmax: [batch, hidden] -> [batch, h, w, c].
+
+    The scores are normalised cell by cell, over the batch alone: over cells too, one board could have all the variance
+    within it and be the same for every z.
     """
 
     grid: Grid
@@ -73,14 +89,27 @@ class GridHead(nn.Module):
 
     @nn.compact
     def __call__(self, hidden: Float[Array, "batch hidden"]) -> Float[Array, "batch h w c"]:
-        shape = (-(-self.grid.height // 4), -(-self.grid.width // 4), CHANNELS)
-        x = nn.relu(self.norm()(nn.Dense(prod(shape), use_bias=False)(hidden))).reshape(-1, *shape)
-        for _ in range(2):
-            x = nn.relu(self.norm()(ConvTranspose(CHANNELS)(x)))
-        x = x[:, : self.grid.height, : self.grid.width]
+        x = stream(hidden, self.grid.height, self.grid.width, norm=self.norm)
         x = self.norm(axis=(-3, -2, -1), bias_init=self._blank)(Conv(self.grid.categories, use_bias=False)(x))
         return nn.softmax(x)
 
     def _blank(self, key: Key[Array, ""], shape: tuple[int, ...], dtype: Any = jnp.float32) -> Float[Array, "h w c"]:
         del key
         return jnp.zeros(shape, dtype).at[..., 0].set(self.blank_bias)
+
+
+class TableHead(nn.Module):
+    """A `stream` over rows by categories, a convolution to one score each, a softmax: [batch, hidden] -> [batch, rows,
+    categories].
+
+    The paper makes "grid and table" in the same way.  Scores are normalised one by one, as a grid's are cell by cell.
+    """
+
+    table: Table
+    norm: partial[nn.BatchNorm]
+
+    @nn.compact
+    def __call__(self, hidden: Float[Array, "batch hidden"]) -> Float[Array, "batch rows categories"]:
+        x = stream(hidden, self.table.rows, self.table.categories, norm=self.norm)
+        scores = Conv(1, use_bias=False)(x).squeeze(-1)
+        return nn.softmax(self.norm(axis=(-2, -1))(scores))

@@ -1,0 +1,43 @@
+"""A push simulated by MuJoCo itself, with cylinders, boxes and real collisions, step by step."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+
+from envs.manipulation import table_scene
+from envs.manipulation.push import GAP, STROKE, STROKE_SECONDS, TOOL_START
+from envs.manipulation.table import CAN_HEIGHT, DIRECTIONS
+
+SECONDS = 2.0
+REST = 1e-3
+"""Long enough for whatever leans to fall, and the speed (m/s and rad/s) below which nothing does."""
+
+
+def push(task, cans, can, direction):
+    """(x, y) of the pushed can, and one of "", "fell", "hit"; there must be room for the tool."""
+    ahead = DIRECTIONS[direction].astype(float)
+    x, y = np.asarray(cans[can], float) + TOOL_START * ahead
+    xml = table_scene.table_xml(task, np.asarray(cans, float), (x, y, math.atan2(ahead[1], ahead[0])))
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    tool, body = model.joint("tool"), model.body(f"can{can}").id
+    geom, free = model.geom(f"can{can}").id, model.joint(f"can{can}")
+    fatal = {i for i in range(model.ngeom) if model.geom(i).name.startswith(("obstacle", "can"))} - {geom}
+    for step in range(round(SECONDS / model.opt.timestep)):
+        phase = math.pi * min(step * model.opt.timestep / STROKE_SECONDS, 1.0)
+        half = (STROKE + GAP) / 2
+        data.qpos[tool.qposadr] = half * (1 - math.cos(phase))
+        data.qvel[tool.dofadr] = half * math.pi / STROKE_SECONDS * math.sin(phase)
+        mujoco.mj_step(model, data)
+        place = data.xpos[body]
+        if place[2] < CAN_HEIGHT / 2 - 0.02 or data.xmat[body][8] < 0.94:
+            return place[:2].copy(), "fell"
+        met = data.contact.geom[data.contact.dist <= 0]
+        if fatal & set(met[(met == geom).any(axis=1)].ravel().tolist()):
+            return place[:2].copy(), "hit"
+        if phase == math.pi and abs(data.qvel[free.dofadr[0] :][:6]).max() < REST:
+            break
+    return data.xpos[body][:2].copy(), ""
