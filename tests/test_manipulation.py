@@ -145,6 +145,14 @@ class TestRewards:
         np.testing.assert_allclose(outs[1].reward, back / 0.4, atol=1e-5)
         assert outs[2].reward == 0
 
+    def test_states_are_told_apart_by_where_the_cans_are(self):
+        out, back, idle = play(table((20, 21), (60, 51)), [(BLUE, RIGHT), (BLUE, LEFT), (GREY, RIGHT)])
+        here, there, still = (SPACE.fingerprint(step.state) for step in (out, back, idle))
+        assert here.dtype == jnp.int32
+        assert np.flatnonzero(here != there).tolist() == [0], "the blue can has moved along x"
+        np.testing.assert_array_equal(there, still)
+        np.testing.assert_array_equal(here[2:4], [60, 51])
+
     def test_success_pays_the_last_progress_too(self):
         out = play(table((52, 21), reach=50), [(BLUE, RIGHT)])[-1]
         np.testing.assert_allclose(out.reward, 1 + 0.08 / 0.4, atol=1e-5)
