@@ -47,9 +47,9 @@ def greedy(network: QNetwork, params: Any, obs: Obs) -> Int[Array, "..."]:
 
 
 def epsilon_greedy(
-    network: QNetwork, params: Any, obs: Obs, key: Key[Array, ""], epsilon: Float[Array, ""] | float
+    network: QNetwork, params: Any, obs: Obs, key: Key[Array, ""], epsilon: Float[Array, "..."] | float
 ) -> Int[Array, "..."]:
-    """Greedy actions, each replaced by a uniform one with probability `epsilon`; consumes `key`."""
+    """Greedy actions, each replaced by a uniform one with probability `epsilon`, one for all or one each; consumes `key`."""
     action = greedy(network, params, obs)
     key_explore, key_action = jax.random.split(key)
     explore = jax.random.uniform(key_explore, action.shape) < epsilon

@@ -200,14 +200,22 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
 
         Draws from `key_eval` alone, so that evaluating more or less often changes nothing in training.
         """
-        key_target, key_propose, key_probe, key_steps = jax.random.split(jax.random.fold_in(state.key_eval, clock.env_steps), 4)
+        key_propose, key_play, key_steps = jax.random.split(jax.random.fold_in(state.key_eval, clock.env_steps), 3)
+        episodes = config.eval_episodes
+        tasks = jax.tree.map(lambda x: jnp.broadcast_to(x, (episodes, *jnp.shape(x))), state.target)
+        epsilon = jnp.zeros(episodes)
+        w = curriculum.propose(state.curriculum, key_propose, config.probe_tasks, hparams) if curriculum.generates else None
+        if w is not None:
+            tasks = jax.tree.map(lambda *sources: jnp.concatenate(sources), tasks, jax.vmap(space.instantiate)(w))
+            explores = learner.epsilon_schedule(clock.env_steps - config.warmup_steps, hparams)
+            epsilon = jnp.concatenate([epsilon, jnp.full(config.probe_tasks, explores)])
 
         def act(obs: Obs, key: Key[Array, ""]) -> Int[Array, "n"]:
-            del key
-            return learner.greedy(network, state.learner.params, obs)
+            return learner.epsilon_greedy(network, state.learner.params, obs, key, epsilon)
 
-        targets = jax.tree.map(lambda x: jnp.broadcast_to(x, (config.eval_episodes, *jnp.shape(x))), state.target)
-        outcome, _ = evaluation.play(space, targets, act, key_target)
+        # All side by side: the environments' step is compiled and looped over once.
+        played = evaluation.play(space, tasks, act, key_play)
+        outcome, _ = jax.tree.map(lambda x: x[:episodes], played)
         score = jnp.mean(outcome.episode_return)
         kept_learner, kept, restored = learner.keep_or_restore(state.learner, state.kept, score)
         metrics = {
@@ -217,17 +225,10 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             "restored": restored.astype(jnp.float32),
             **_sources(state.replay, config.return_window, since=config.warmup_steps // steps),
         }
-        if curriculum.generates:
-            epsilon = learner.epsilon_schedule(clock.env_steps - config.warmup_steps, hparams)
-            w = curriculum.propose(state.curriculum, key_propose, config.probe_tasks, hparams)
-            tasks = jax.vmap(space.instantiate)(w)
-
-            def explore(obs: Obs, key: Key[Array, ""]) -> Int[Array, "n"]:
-                return learner.epsilon_greedy(network, state.learner.params, obs, key, epsilon)
-
-            probe, transitions = evaluation.play(space, tasks, explore, key_probe)
+        if w is not None:
+            probe, transitions, probe_tasks = jax.tree.map(lambda x: x[episodes:], (*played, tasks))
             rollouts = evaluation.sample_rollouts(w, probe, transitions, key_steps, steps=space.horizon)
-            descriptions = jax.vmap(lambda task: space.describe(task, state.target))(tasks)
+            descriptions = jax.vmap(lambda task: space.describe(task, state.target))(probe_tasks)
             metrics |= {
                 "probe_return": jnp.mean(probe.episode_return),
                 "probe_success": jnp.mean(probe.success.astype(jnp.float32)),

@@ -94,7 +94,8 @@ def test_metrics_are_finite_and_the_clock_counts_every_source(method):
     for metrics in history:
         for name, value in metrics.items():
             assert value.shape == (2,), name
-            assert np.isfinite(value).all(), name
+            # Nothing is known of a source until an episode that began after the warm-up is over.
+            assert np.isfinite(value).all() or (name.startswith(("behaviour_", "generated_")) and metrics is history[0]), name
 
 
 def test_a_target_of_another_shape_is_refused():
