@@ -84,7 +84,17 @@ def test_every_preset_makes_a_trainer(preset):
     make_trainer(envs.make("grid_world"), envs.load_target("grid_world", "A"), PRESETS[preset][0])
 
 
-@pytest.mark.parametrize("method", [*METHODS, "apt_gen+rnd"])
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_makes_a_program(method):
+    """Traced, not compiled: shapes and dtypes fit, and the state keeps its structure."""
+    trainer = make_trainer(SPACE, TARGET, config(method, **SWITCHES))
+    state = jax.eval_shape(trainer.init, jax.random.key(0), jax.tree.map(jnp.float32, HParams()))
+    after, _, metrics = jax.eval_shape(trainer.chunk, state, Clock.start(), jax.tree.map(jnp.float32, HParams()))
+    assert after == state
+    assert "target_return" in metrics
+
+
+@pytest.mark.parametrize("method", ["apt_gen+rnd", "random", "dqn", "alp_gmm", "goal_gan", "ride"])
 def test_metrics_are_finite_and_the_clock_counts_every_source(method):
     """With everything switched on; the other tests run the paper's form."""
     _, hparams = PRESETS["fast"]
@@ -95,7 +105,7 @@ def test_metrics_are_finite_and_the_clock_counts_every_source(method):
         for name, value in metrics.items():
             assert value.shape == (2,), name
             # Nothing is known of a source until an episode that began after the warm-up is over.
-            assert np.isfinite(value).all() or (name.startswith(("behaviour_", "generated_")) and metrics is history[0]), name
+            assert np.isfinite(value).all() or name.startswith(("behaviour_", "generated_")), name
 
 
 def test_a_target_of_another_shape_is_refused():
@@ -122,12 +132,12 @@ def test_a_seed_alone_equals_the_same_seed_among_others(layout):
         assert_lane_equal(several, lane, alone)
 
 
-@pytest.mark.parametrize("method", ["alp_gmm", "goal_gan", "icm", "rnd", "ride"])
-def test_a_seed_of_another_method_alone_equals_the_same_seed_beside_one(method):
+@pytest.mark.parametrize("method", ["alp_gmm", "goal_gan", "ride"])
+def test_a_seed_of_another_method_is_the_same_beside_any_other(method):
     _, hparams = PRESETS["fast"]
-    several, _, _ = run(config(method, **SWITCHES), [0, 1], hparams=[hparams] * 2)
-    alone, _, _ = run(config(method, **SWITCHES), [1], hparams=[hparams])
-    assert_lane_equal(several, 1, alone)
+    first, _, _ = run(config(method, **SWITCHES), [0, 1], hparams=[hparams] * 2)
+    second, _, _ = run(config(method, **SWITCHES), [1, 2], hparams=[hparams] * 2)
+    assert_lane_equal(first, 1, jax.tree.map(lambda x: x[:1], second))
 
 
 def test_lanes_may_be_laid_out_in_groups():
