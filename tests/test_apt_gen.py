@@ -15,7 +15,7 @@ from apt_jax import replay as rp
 from apt_jax.config import HParams
 from apt_jax.curricula import apt_gen
 from apt_jax.curricula import apt_gen_objectives as objectives
-from apt_jax.specs import Grid
+from apt_jax.specs import Grid, Table
 from tests.corridor import Corridor
 from tests.test_trainer import CONFIG, run
 
@@ -144,6 +144,15 @@ def test_exploration_replaces_a_share_of_cells_and_jitters_vectors_within_their_
     still = apt_gen.explore(spec, w, jax.random.key(0), HParams(cell_noise=0.0, vector_noise=0.0))
     for name in w:
         np.testing.assert_array_equal(still[name], w[name])
+
+
+def test_exploration_and_hardening_treat_a_table_like_a_grid():
+    spec = {"places": Table(2, 4)}
+    w = {"places": jnp.broadcast_to(jnp.array([0.0, 0.0, 2.0, 0.0]), (4000, 2, 4))}
+    explored = apt_gen.explore(spec, w, jax.random.key(0), HParams(cell_noise=0.2))
+    moved = jnp.argmax(explored["places"], axis=-1) != 2
+    np.testing.assert_allclose(jnp.mean(moved), 0.15, atol=0.01, err_msg="three quarters of the replaced rows change")
+    np.testing.assert_array_equal(objectives.as_instantiated(spec, w)["places"][0], [[0, 0, 1, 0]] * 2)
 
 
 def generated_episodes(returns, ends):

@@ -18,7 +18,7 @@ from apt_jax.networks import (
     spectral_normalize,
 )
 from apt_jax.networks.encoders import observation_features, parameter_features
-from apt_jax.specs import Grid, Spec, Vector
+from apt_jax.specs import Grid, Spec, Table, Vector
 
 NUM_ACTIONS = 4
 NOISE_SIZE = 8
@@ -26,6 +26,7 @@ OBS_SPEC: Spec = {"agent": Vector(2, 0, 9, "uint8"), "view": Grid(7, 7, 3), "obj
 PARAM_SPEC: Spec = {
     "tiles": Grid(8, 8, 3),
     "table": Grid(6, 4, 3),
+    "places": Table(3, 24),
     "goal": Vector(2, 0.0, 9.0),
     "angle": Vector(1, -2.0, 1.0),
 }
@@ -52,7 +53,7 @@ def random_transition(seed, lead=()):
 
 def random_w(seed, lead=()):
     rng = np.random.default_rng(seed)
-    shapes = {"tiles": (8, 8, 3), "table": (6, 4, 3), "goal": (2,), "angle": (1,)}
+    shapes = {"tiles": (8, 8, 3), "table": (6, 4, 3), "places": (3, 24), "goal": (2,), "angle": (1,)}
     return {name: jnp.asarray(rng.uniform(size=(*lead, *shape)), jnp.float32) for name, shape in shapes.items()}
 
 
@@ -93,7 +94,7 @@ PAPER_SIZES = {
     + dense(1, 64)
     + dense(8 * 64, 128)
     + dense(128, 1),
-    "value": encoder_size(vectors=[2, 1], grids=[(3, 4), (3, 2)]) + dense(4 * 64, 128) + dense(128, 1),
+    "value": encoder_size(vectors=[2, 1, 3 * 24], grids=[(3, 4), (3, 2)]) + dense(5 * 64, 128) + dense(128, 1),
 }
 
 
@@ -149,6 +150,9 @@ def test_features():
     np.testing.assert_array_equal(features["tiles"], w["tiles"])
     np.testing.assert_allclose(features["goal"], w["goal"] / 9.0)
     np.testing.assert_allclose(features["angle"], w["angle"] / 2.0)
+    np.testing.assert_array_equal(features["places"], w["places"].reshape(72))
+    chosen = observation_features({"places": Table(2, 3)}, {"places": jnp.array([2, 0], jnp.uint8)})
+    np.testing.assert_array_equal(chosen["places"], [0, 0, 1, 1, 0, 0])
 
 
 def test_pool_weighs_the_initial_logit_as_one_of_all_encodings():
@@ -183,12 +187,12 @@ def test_generator_shapes_and_bounds(train):
     z, variables = noise_and_variables()
     w = generate_train(variables, 100.0 * z)[0] if train else generate(variables, 100.0 * z)
     chex.assert_shape([w["tiles"], w["table"]], [(64, 8, 8, 3), (64, 6, 4, 3)])
-    chex.assert_shape([w["goal"], w["angle"]], [(64, 2), (64, 1)])
+    chex.assert_shape([w["places"], w["goal"], w["angle"]], [(64, 3, 24), (64, 2), (64, 1)])
     chex.assert_tree_all_finite(w)
     for name in ("goal", "angle"):
         assert w[name].min() >= PARAM_SPEC[name].low
         assert w[name].max() <= PARAM_SPEC[name].high
-    for name in ("tiles", "table"):
+    for name in ("tiles", "table", "places"):
         assert w[name].min() >= 0
         np.testing.assert_allclose(w[name].sum(-1), 1.0, rtol=1e-5)
 
@@ -202,7 +206,9 @@ def test_generator_sizes():
         (64 + norm) * 16 * cells + 2 * (9 * 16 + norm) * 16 + 9 * 16 * 3 + norm * 3 * scores
         for cells, scores in ((4, 64), (2, 24))
     )
-    assert count(variables["params"]) == (NOISE_SIZE + norm) * 64 + vectors + grids
+    # A table is made like a grid of rows by categories with one channel.
+    table = (64 + norm) * 16 * 6 + 2 * (9 * 16 + norm) * 16 + 9 * 16 + norm * 3 * 24
+    assert count(variables["params"]) == (NOISE_SIZE + norm) * 64 + vectors + grids + table
 
 
 def test_blank_bias_gives_category_0_a_head_start():
@@ -212,13 +218,14 @@ def test_blank_bias_gives_category_0_a_head_start():
     for name in ("tiles", "table"):
         blank = jnp.mean(jnp.argmax(w[name], axis=-1) == 0)
         assert 0.7 < blank < 0.95
+    assert jnp.mean(jnp.argmax(w["places"], axis=-1) == 0) < 0.3  # no place is blank
 
 
 def test_every_cell_differs_with_noise():
     """Regression: normalised over cells too, one board for every z met the normalisation."""
     z, variables = noise_and_variables()
     w, _ = generate_train(variables, z)
-    for name in ("tiles", "table"):
+    for name in ("tiles", "table", "places"):
         assert (jnp.argmax(w[name], axis=-1).std(axis=0) > 0.5).all()
 
 

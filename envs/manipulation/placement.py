@@ -83,10 +83,10 @@ def roadblocks(blocks: Int[Array, "6 4"]) -> Obstacles:
     """A box for every block, there if the block is a roadblock."""
     return Obstacles(
         center=jnp.asarray(centers()),
-        half=jnp.full((BLOCKS, 2), BLOCK / 2),
+        half=jnp.full((BLOCKS, 2), BLOCK / 2, jnp.float32),
         axis=jnp.tile(jnp.array([1.0, 0.0]), (BLOCKS, 1)),
         rounding=jnp.zeros(BLOCKS),
-        height=jnp.where(blocks.reshape(-1) == ROADBLOCK, ROADBLOCK_HEIGHT, 0.0),
+        height=jnp.where(blocks.reshape(-1) == ROADBLOCK, jnp.float32(ROADBLOCK_HEIGHT), 0.0),
     )
 
 

@@ -130,7 +130,7 @@ def simulate(motion: Motion, supported: Callable[[Float[Array, "feet 3"]], Bool[
 
 def stroke(time: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Metres that the tool has gone at a time in seconds, and its speed: half a period of a cosine."""
-    phase = jnp.pi * jnp.minimum(time / STROKE_SECONDS, 1.0)
+    phase = jnp.pi * jnp.clip(time / STROKE_SECONDS, 0.0, 1.0)
     half = (STROKE + GAP) / 2
     return half * (1 - jnp.cos(phase)), half * jnp.pi / STROKE_SECONDS * jnp.sin(phase)
 

@@ -93,8 +93,8 @@ class Task(NamedTuple):
 def on_ground(ground: Bool[Array, "36 24"], points: Float[Array, "n 2"]) -> Bool[Array, "n"]:
     """Whether the surface is there under each point; it is not beyond the table."""
     cells = jnp.floor(points / CELL).astype(jnp.int32)
-    inside = jnp.all((cells >= 0) & (cells < jnp.array(ground.shape)[None]), axis=-1)
-    return inside & ground.at[cells[:, 0], cells[:, 1]].get(mode="clip")
+    nearest = jnp.clip(cells, 0, jnp.array(ground.shape)[None] - 1)
+    return jnp.all(cells == nearest, axis=-1) & jnp.asarray(ground)[nearest[:, 0], nearest[:, 1]]
 
 
 def distances(obstacles: Obstacles, point: Float[Array, "2"]) -> Float[Array, "24"]:

@@ -75,3 +75,11 @@ can 64 30
 range 10
 """,
 }
+
+DEMONSTRATIONS = {
+    "A": (0, 3, 0, 0, 9, 0, 0),
+    "B": (1, 6, 1, 1, 0, 9, 0, 0, 0, 3),
+    "C": (6, 6, 5, 0, 0, 0, 0, 0),
+    "out_of_space": (1, 4, 0, 4, 0, 0, 5, 0, 11, 0, 8, 3),
+}
+"""Actions of a shortest solution of each target (`solver.solve`), which succeed wherever the goal's centre is drawn."""

@@ -1,0 +1,194 @@
+"""What a push costs: `python -m experiments.benchmarks.manipulation`.
+
+Random pushes on uniformly random tables, side by side in one compiled program, against MuJoCo itself: the same model, and
+the true shapes of everything on the table.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
+import tyro
+from jaxtyping import Array, Float, Key
+
+import envs
+from envs.manipulation import scene, table_scene
+from envs.manipulation.push import GAP, STEPS, STROKE, STROKE_SECONDS, TOOL_START, stroke
+from envs.manipulation.table import DIRECTIONS, Task
+from experiments.benchmarks import _measure
+from experiments.benchmarks._measure import Options, Timing
+from experiments.errors import exit_with
+
+
+@dataclass(frozen=True)
+class Args(Options):
+    """Time pushes, alone and side by side.
+
+    Attributes:
+      envs: numbers of environments side by side.
+      cores: cores that the process may use.
+      at_least: seconds that one measurement takes at least.
+      checked: random pushes that are looked through for what is not a number.
+      true_pushes: pushes with true shapes that are timed.
+    """
+
+    repeats: int = 3
+    envs: tuple[int, ...] = (1, 16, 64, 256)
+    cores: int = 1
+    at_least: float = 2.0
+    checked: int = 10_000
+    true_pushes: int = 50
+
+
+@dataclass(frozen=True)
+class Side:
+    """Environments side by side: the time of one push of all of them, and the process's largest resident size after it, in
+    bytes."""
+
+    timing: Timing
+    peak_memory: int
+
+
+def main() -> int:
+    """The command line."""
+    args = tyro.cli(Args, prog="python -m experiments.benchmarks.manipulation")
+    _measure.check(args)
+    _measure.pin(args.cores)
+    # No compilation cache: the seconds to compile are results too.
+    jax.config.update("jax_num_cpu_devices", 1)
+    if args.quick:
+        args = dataclasses.replace(args, repeats=1, envs=args.envs[:2], at_least=0.0, checked=64, true_pushes=2)
+    sides = {n: time_pushes(n, args) for n in args.envs}
+    same, true = time_same_model(args), time_true_shapes(args)
+    faults = count_faults(args.checked)
+    rows = [
+        [f"MJX, {n} side by side", _cell(side.timing, n), *_costs(side.timing, n), f"{side.peak_memory / 2**20:.0f}"]
+        for n, side in sides.items()
+    ]
+    rows.append(["MuJoCo, same model", _cell(same, 1), *_costs(same, 1), ""])
+    rows.append(["MuJoCo, true shapes", _cell(true, 1), *_costs(true, 1), ""])
+    header = ["pushes", "per second", "minutes per 100,000", "compile, s", "peak memory, MiB"]
+    text = f"{_measure.table(header, rows)}\n{faults} of {args.checked:,} random pushes gave what is not a number.\n"
+    results = {"side_by_side": sides, "same_model": same, "true_shapes": true, "faults": faults}
+    _measure.report("manipulation", args, results, text)
+    return 0
+
+
+def random_pushes(key: Key[Array, ""], n: int) -> tuple[Any, Any, Array]:
+    """Uniformly random tasks, states and actions, leaves [n, ...]; consumes `key`.
+
+    In the task space itself a push rarely finds its can, so the first can is made to appear and is the one that is pushed.
+    """
+    space = envs.make("manipulation")
+    key_w, key_reset, key_action = jax.random.split(key, 3)
+    w = jax.vmap(space.sample_uniform)(jax.random.split(key_w, n))
+    chosen = jax.nn.one_hot(jnp.argmax(w["placement"][:, 0], axis=-1), w["placement"].shape[-1]).reshape(n,
+    *w["blocks"].shape[1:3]) tasks = jax.vmap(space.instantiate)({**w, "blocks": w["blocks"].at[..., 0].add(chosen)})
+    states, _ = jax.vmap(space.reset)(jax.random.split(key_reset, n), tasks)
+    return tasks, states, jax.random.randint(key_action, (n,), 0, len(DIRECTIONS))
+
+
+def time_pushes(n: int, args: Args) -> Side:
+    """Environments that start a new random task with every push, so that none is over before the others begin."""
+    step = jax.vmap(envs.make("manipulation").step)
+
+    def push(carry: tuple[Key[Array, ""], Float[Array, ""]], _: None) -> tuple[Key[Array, ""], Float[Array, ""]]:
+        key, key_push = jax.random.split(carry[0])
+        tasks, states, action = random_pushes(key_push, n)
+        return key, carry[1] + jnp.sum(step(states, action, tasks).reward)
+
+    carry = (jax.random.key(0), jnp.float32(0))
+    timing = _measure.time_loop(push, carry, None, repeats=args.repeats, at_least=args.at_least)
+    return Side(timing, _measure.peak_memory())
+
+
+def time_same_model(args: Args) -> Timing:
+    """The scene of a push by `mujoco.rollout`, on ground everywhere; its tool is driven by a strong servo along the stroke."""
+    xml = scene.push_xml().replace("</mujoco>", '<actuator><position joint="tool" kp="2e6" kv="4e4"/></actuator></mujoco>')
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.qpos[7] = TOOL_START
+    state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    places = np.asarray(jax.vmap(stroke)(jnp.arange(STEPS) * scene.TIMESTEP)[0])
+    control = (TOOL_START + places)[None, :, None].astype(float)
+    pushes = 2 if args.quick else 200
+
+    def run() -> float:
+        began = time.perf_counter()
+        mujoco.rollout.rollout(model, data, np.tile(state, (pushes, 1)), np.tile(control, (pushes, 1, 1)))
+        return (time.perf_counter() - began) / pushes
+
+    run()
+    return Timing(tuple(run() for _ in range(args.repeats)), 0.0)
+
+
+def time_true_shapes(args: Args) -> Timing:
+    """Cylinders, boxes and all blocks of random tables, each pushed once for as long as a push of ours lasts."""
+    tasks, _, directions = jax.device_get(random_pushes(jax.random.key(0), args.true_pushes))
+    scenes = [
+        _true_scene(jax.tree.map(lambda leaf, i=i: leaf[i], tasks), int(directions[i]))  # type: ignore[misc]
+        for i in range(args.true_pushes)
+    ]
+
+    def run() -> float:
+        began = time.perf_counter()
+        for model in scenes:
+            _push_true(model)
+        return (time.perf_counter() - began) / args.true_pushes
+
+    return Timing(tuple(run() for _ in range(args.repeats)), 0.0)
+
+
+def _true_scene(task: Task, direction: int) -> mujoco.MjModel:
+    ahead = DIRECTIONS[direction].astype(float)
+    cans = np.asarray(task.cans, float)
+    x, y = cans[0] + TOOL_START * ahead
+    return mujoco.MjModel.from_xml_string(table_scene.table_xml(task, cans, (x, y, math.atan2(ahead[1], ahead[0]))))
+
+
+def _push_true(model: mujoco.MjModel) -> None:
+    data = mujoco.MjData(model)
+    tool = model.joint("tool")
+    for step in range(round(STEPS * scene.TIMESTEP / model.opt.timestep)):
+        phase = math.pi * min(step * model.opt.timestep / STROKE_SECONDS, 1.0)
+        half = (STROKE + GAP) / 2
+        data.qpos[tool.qposadr] = half * (1 - math.cos(phase))
+        data.qvel[tool.dofadr] = half * math.pi / STROKE_SECONDS * math.sin(phase)
+        mujoco.mj_step(model, data)
+
+
+def count_faults(pushes: int) -> int:
+    """Random pushes after which a place, a reward or a height is not a number."""
+    batch = min(pushes, 250)
+    step = jax.vmap(envs.make("manipulation").step)
+
+    @jax.jit
+    def faults(key: Key[Array, ""]) -> Array:
+        tasks, states, action = random_pushes(key, batch)
+        out = step(states, action, tasks)
+        leaves = jax.tree.leaves((out.state.cans, out.obs, out.reward))
+        return jnp.sum(~jnp.all(jnp.stack([jnp.isfinite(x).reshape(batch, -1).all(axis=1) for x in leaves]), axis=0))
+
+    return sum(int(faults(jax.random.key(1 + i))) for i in range(-(-pushes // batch)))
+
+
+def _cell(timing: Timing, n: int) -> str:
+    return _measure.number(n / timing.median)
+
+
+def _costs(timing: Timing, n: int) -> tuple[str, str]:
+    return _measure.number(timing.median / n * 100_000 / 60), f"{timing.compile_seconds:.1f}"
+
+
+if __name__ == "__main__":
+    exit_with(main)
