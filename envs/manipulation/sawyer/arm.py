@@ -24,10 +24,9 @@ BASE = (COLUMNS * BLOCK / 2, -0.27)
 HEIGHT = 0.915
 """Metres of the pedestal, from the floor to the base."""
 
-STICK = 0.3
-STICK_RADIUS = 0.005
-"""Metres from the flange to the centre of the tool's tip, and the stick's radius: thinner than the tip, so that only this
-touches a can."""
+STICK, STICK_RADIUS, BEHIND = 0.3, 0.005, 0.009
+"""Metres from the flange to the tool's tip, radius of the stick, and how far its axis is behind the tip's centre, so that only the
+tip touches a can, even where the tool leans over it."""
 
 TOOL_MASS = 0.2
 
@@ -210,8 +209,8 @@ def _tool() -> str:
       <inertial pos="0 0 {FLANGE + STICK / 3}" mass="{TOOL_MASS}" diaginertia="0.002 0.002 0.0001"/>
       <geom type="cylinder" fromto="0 0 {FLANGE} 0 0 {FLANGE + 0.06}" size="0.02" rgba="{BLACK}"/>
       <geom name="stick" type="cylinder" fromto="{ends}" size="{STICK_RADIUS}" rgba="{BLACK}" {solid}/>
-      <geom name="tip" type="box" pos="0 0 {tip}" size="{_numbers(TOOL_HALF)}" rgba="{BLACK}" {solid}/>
-      <site name="tip" pos="0 0 {tip}" size="0.001" group="4"/>
+      <geom name="tip" type="box" pos="{BEHIND} 0 {tip}" size="{_numbers(TOOL_HALF)}" rgba="{BLACK}" {solid}/>
+      <site name="tip" pos="{BEHIND} 0 {tip}" size="0.001" group="4"/>
     </body>"""
 
 

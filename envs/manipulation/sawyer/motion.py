@@ -16,8 +16,8 @@ from envs.manipulation.scene import TOOL_HALF, TOOL_HEIGHT
 from envs.manipulation.table import CAN_HEIGHT, CAN_RADIUS, Task, distances
 from envs.manipulation.table_scene import TIMESTEP
 
-UPRIGHT, LEAN_FROM, LEAN_TO = 0.75, 0.75, 1.05
-LEAN = 0.35
+LEAN_FROM, LEAN_TO = 0.88, 1.03
+LEAN = 0.2
 """Metres from the robot's axis from which on the tool leans outwards, and to which, by how much in radians: the arm is too
 short to hold it upright everywhere."""
 
@@ -75,8 +75,7 @@ class Planner:
 
     def push(self, place: Float[np.ndarray, "2"], ahead: Float[np.ndarray, "2"]) -> Plan:
         """From where the arm is, pushes a can at `place` in the direction `ahead`, which is along x or y."""
-        heading = np.pi / 2 if abs(ahead[1]) > 0.5 else 0.0
-        leaning = lean(place)
+        heading, leaning = _heading(ahead), lean(place)
         behind = place - ahead * (CAN_RADIUS + GAP + _extent(heading, leaning, ahead))
         height = self._clear(self.pose[:2], behind)
         above = _pose(behind, height, heading, leaning)
@@ -111,6 +110,11 @@ class Planner:
         near = np.asarray(jax.vmap(distances, in_axes=(None, 0))(self.task.obstacles, way)) < WIDTH
         highest = float(np.max(np.where(near, self.task.obstacles.height, 0.0)))
         return max(highest, CAN_HEIGHT) + SPARE + TOOL_HALF[2]
+
+
+def _heading(ahead: Float[np.ndarray, "2"]) -> float:
+    """The angle of a direction along x or y, from -pi / 2 to pi: no turn between two of them brings the last joint to its limit."""
+    return float(np.arctan2(ahead[1] + 0.0, ahead[0]))
 
 
 def lean(place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
