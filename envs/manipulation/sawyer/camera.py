@@ -49,7 +49,7 @@ class Camera:
         self.view.lookat, self.view.distance = LOOK_AT, DISTANCE
         self.view.azimuth, self.view.elevation = AZIMUTH, ELEVATION
 
-    def picture(self, data: mujoco.MjData) -> UInt8[np.ndarray, "480 640 3"]:
+    def picture(self, data: mujoco.MjData) -> UInt8[np.ndarray, "360 480 3"]:
         """RGB picture of the simulation as it is."""
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self.model, data, self.option, None, self.view, everything, self.scene)

@@ -27,7 +27,7 @@ LAST_SECONDS = 1.0
 """What is shown after an episode's end."""
 
 Watch = Callable[[mujoco.MjModel, mujoco.MjData], None]
-"""Told of every time step."""
+"""Told of the start and of every time step."""
 
 
 class Push(NamedTuple):
@@ -64,7 +64,8 @@ def replay(task: Task, goal: Float[np.ndarray, "2"], actions: Sequence[int], wat
         pushes.append(Push(cans, event, not event and inside, tracking))
         if event or pushes[-1].success:
             break
-    scene.wait(LAST_SECONDS)
+    if watch:
+        scene.wait(LAST_SECONDS)
     return pushes
 
 
@@ -84,6 +85,8 @@ class Scene:
         self.goal_joints = self.planner.joints
         self.data.qpos[self.positions] = self.goal_joints
         mujoco.mj_forward(self.model, self.data)
+        if watch:
+            watch(self.model, self.data)
 
     def cans(self) -> Float[np.ndarray, "3 2"]:
         """Where the cans are; `ABSENT` those that are not."""

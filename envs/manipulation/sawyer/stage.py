@@ -26,8 +26,8 @@ STRIP = 0.004
 PREFIX = "sawyer/"
 """Before the names of all that is the robot's."""
 
-PICTURE = (640, 480)
-"""Pixels of a picture at most."""
+PICTURE = (480, 360)
+"""Pixels of a picture."""
 
 
 def mirror(task: Task) -> Task:
@@ -61,9 +61,9 @@ def stage(task: Task, goal: Float[np.ndarray, "2"]) -> mujoco.MjModel:
         world.add_geom(
             type=box, pos=[x, y, 0], size=[length / 2, STRIP / 2, 0.001], rgba=_opaque(GOAL_COLOR), contype=0, conaffinity=0
         )
-    world.add_light(pos=[center[0] + 0.5, 1.2, 2.0], dir=[-0.25, -0.45, -1.0], diffuse=[0.6, 0.6, 0.6], castshadow=True)
-    world.add_light(pos=[center[0] - 0.8, 1.0, 1.5], dir=[0.4, -0.4, -1.0], diffuse=[0.25, 0.25, 0.25], castshadow=False)
-    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    world.add_light(pos=[center[0] + 0.5, 1.2, 2.0], dir=[-0.25, -0.45, -1.0], diffuse=[0.5, 0.5, 0.5], castshadow=True)
+    world.add_light(pos=[center[0] - 0.8, 1.0, 1.5], dir=[0.4, -0.4, -1.0], diffuse=[0.15, 0.15, 0.15], castshadow=False)
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35, 0.35, 0.35], [0.2, 0.2, 0.2]
     spec.visual.global_.offwidth, spec.visual.global_.offheight = PICTURE
     spec.attach(mujoco.MjSpec.from_string(arm_xml()), prefix=PREFIX, frame=world.add_frame())
     return spec.compile()
