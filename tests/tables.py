@@ -68,7 +68,7 @@ def play(task, actions, goal=None, *, whole=True):
     return outs
 
 
-def params(blocks=(), cans=(), offset=np.zeros(6), reach=0.3):
+def params(blocks=(), cans=(), offset=(0.0,) * 6, reach=0.3):
     """A parameter with categories `blocks` {(column, row): category} on flat ones, and cans on blocks {index: (column, row)}.
 
     Cans that are not named share the block of the first one, hence do not appear.

@@ -93,8 +93,9 @@ class TestPush:
         assert abs(gaps[fell].max() - 100 * stroke) <= 1.0
 
     def test_a_fall_is_told_at_the_edge(self):
-        outcome = push_all([(table((84, 30)), BLUE, RIGHT), (table((24, 37), rows="FFFFFF\nFFFFFF\nFF.FFF\nFFFFFF"), BLUE,
-        RIGHT)]) assert outcome.fell.all()
+        pit = table((24, 37), rows="FFFFFF\nFFFFFF\nFF.FFF\nFFFFFF")
+        outcome = push_all([(table((84, 30)), BLUE, RIGHT), (pit, BLUE, RIGHT)])
+        assert outcome.fell.all()
         assert 0.90 <= outcome.position[0, 0] <= 0.945
         assert 0.30 <= outcome.position[1, 0] <= 0.345
 
@@ -121,8 +122,9 @@ class TestPush:
     def test_nothing_moves_without_room_for_the_tool(self):
         wall = table((35, 22), rows="FFFFFF\nF#FFFF\nFFFFFF\nFFFFFF")
         cans = table((30, 20), (39.5, 20))
-        outcome = push_all([(wall, BLUE, RIGHT), (cans, GREEN, RIGHT), (cans, BLUE, LEFT), (wall, BLUE, NEAR), (wall, BLUE,
-        AWAY)]) np.testing.assert_array_equal(outcome.position[:3], [wall.cans[BLUE], cans.cans[GREEN], cans.cans[BLUE]])
+        blocked = [(wall, BLUE, RIGHT), (cans, GREEN, RIGHT), (cans, BLUE, LEFT)]
+        outcome = push_all([*blocked, (wall, BLUE, NEAR), (wall, BLUE, AWAY)])
+        np.testing.assert_array_equal(outcome.position[:3], [wall.cans[BLUE], cans.cans[GREEN], cans.cans[BLUE]])
         assert not outcome.hit.any()
         assert not outcome.fell.any()
         assert (np.linalg.norm(outcome.position[3:] - np.asarray(wall.cans[BLUE]), axis=-1) > 0.1).all()

@@ -90,7 +90,7 @@ class TestSolver:
 
 
 def message(text):
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(ValueError, match=r"line|rows, expected|no '") as caught:
         SPACE.parse_target(text)
     return str(caught.value)
 
@@ -180,8 +180,9 @@ class TestPictures:
 
     def test_every_kind_has_its_colour(self):
         rows = "FFFFFF\nF.#FFF\nFFFFFF\nFFFFFF"
-        picture = SPACE.render(table((20, 50), (40, 50), (60, 50), rows=rows, extra="cylinder 80 50 5 30", reach=30),
-        tile_size=16) assert picture.shape == (64, 96, 3)
+        task = table((20, 50), (40, 50), (60, 50), rows=rows, extra="cylinder 80 50 5 30", reach=30)
+        picture = SPACE.render(task, tile_size=16)
+        assert picture.shape == (64, 96, 3)
         assert picture.dtype == np.uint8
         places = [(5, 5), (22, 22), (37, 22), (20, 50), (40, 50), (60, 50), (80, 50), (70, 21)]
         assert len({self.pixel(picture, *place) for place in places}) == len(places)

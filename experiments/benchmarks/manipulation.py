@@ -52,7 +52,8 @@ class Args(Options):
 @dataclass(frozen=True)
 class Side:
     """Environments side by side: the time of one push of all of them, and the process's largest resident size after it, in
-    bytes."""
+    bytes.
+    """
 
     timing: Timing
     peak_memory: int
@@ -91,8 +92,9 @@ def random_pushes(key: Key[Array, ""], n: int) -> tuple[Any, Any, Array]:
     space = envs.make("manipulation")
     key_w, key_reset, key_action = jax.random.split(key, 3)
     w = jax.vmap(space.sample_uniform)(jax.random.split(key_w, n))
-    chosen = jax.nn.one_hot(jnp.argmax(w["placement"][:, 0], axis=-1), w["placement"].shape[-1]).reshape(n,
-    *w["blocks"].shape[1:3]) tasks = jax.vmap(space.instantiate)({**w, "blocks": w["blocks"].at[..., 0].add(chosen)})
+    first = w["placement"][:, 0]
+    flat = jax.nn.one_hot(jnp.argmax(first, axis=-1), first.shape[-1]).reshape(w["blocks"].shape[:-1])
+    tasks = jax.vmap(space.instantiate)({**w, "blocks": w["blocks"].at[..., 0].add(flat)})
     states, _ = jax.vmap(space.reset)(jax.random.split(key_reset, n), tasks)
     return tasks, states, jax.random.randint(key_action, (n,), 0, len(DIRECTIONS))
 
@@ -135,10 +137,7 @@ def time_same_model(args: Args) -> Timing:
 def time_true_shapes(args: Args) -> Timing:
     """Cylinders, boxes and all blocks of random tables, each pushed once for as long as a push of ours lasts."""
     tasks, _, directions = jax.device_get(random_pushes(jax.random.key(0), args.true_pushes))
-    scenes = [
-        _true_scene(jax.tree.map(lambda leaf, i=i: leaf[i], tasks), int(directions[i]))  # type: ignore[misc]
-        for i in range(args.true_pushes)
-    ]
+    scenes = [_true_scene(jax.tree.map(lambda leaf, i=i: leaf[i], tasks), int(directions[i])) for i in range(args.true_pushes)]
 
     def run() -> float:
         began = time.perf_counter()
