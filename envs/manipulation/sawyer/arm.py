@@ -1,10 +1,10 @@
 """The Sawyer arm: links, joints and motors of the real robot, drawn from cylinders, with a stick-like tool at its flange.
 
-Frames, masses, inertias, limits of position, speed and torque are the manufacturer's: `sawyer_description/urdf/sawyer_base.urdf.xacro`
-of Rethink Robotics' `sawyer_robot` (Apache-2.0).  The joints have no friction and the motors no inertia of their own: the
-manufacturer publishes neither.
+Frames, masses, inertias and limits of position, speed and torque are the manufacturer's, from
+`sawyer_description/urdf/sawyer_base.urdf.xacro` of Rethink Robotics' `sawyer_robot` (Apache-2.0).  The joints have no friction
+and the motors no inertia of their own: that file gives no measured ones.
 
-A link reaches from its joint's axis to the next one's, so the housings follow from the frames; their radii are those of
+A link reaches from its joint's axis to the next one's, so the housings follow from the frames; their radii are about those of
 the same file's collision shapes.
 """
 
@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from envs.manipulation.scene import TOOL_HALF
-from envs.manipulation.table import COLUMNS, BLOCK
+from envs.manipulation.table import BLOCK, COLUMNS
 
 Vector = tuple[float, float, float]
 
@@ -25,8 +25,8 @@ HEIGHT = 0.915
 """Metres of the pedestal, from the floor to the base."""
 
 STICK, STICK_RADIUS, BEHIND = 0.3, 0.005, 0.009
-"""Metres from the flange to the tool's tip, radius of the stick, and how far its axis is behind the tip's centre, so that only the
-tip touches a can, even where the tool leans over it."""
+"""Metres from the flange to the tool's tip, radius of the stick, and how far its axis is behind the tip's centre, so that only
+the tip touches a can, even where the tool leans over it."""
 
 TOOL_MASS = 0.2
 

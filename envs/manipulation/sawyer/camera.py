@@ -14,7 +14,6 @@ from jaxtyping import UInt8
 
 from envs.manipulation.sawyer.arm import BASE
 from envs.manipulation.sawyer.stage import PICTURE
-from envs.manipulation.table import SIZE
 
 LOOK_AT = (BASE[0], 0.10, 0.19)
 DISTANCE, AZIMUTH, ELEVATION = 1.85, -90.0, -33.0
@@ -69,9 +68,7 @@ def backend() -> str:
     named = os.environ.get("MUJOCO_GL", "")
     found = named or next((name for name, library in LIBRARIES.items() if ctypes.util.find_library(library)), "")
     if not found:
-        raise NoGraphics(
-            "no OpenGL to draw with: install EGL (Debian and Ubuntu: libegl1 libopengl0) or OSMesa (libosmesa6)"
-        )
+        raise NoGraphics("no OpenGL to draw with: install EGL (Debian and Ubuntu: libegl1 libopengl0) or OSMesa (libosmesa6)")
     return found
 
 

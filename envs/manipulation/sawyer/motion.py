@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from envs.manipulation.push import GAP, STROKE, STROKE_SECONDS
 from envs.manipulation.sawyer.arm import BASE
-from envs.manipulation.sawyer.kinematics import Joints, Kinematics, Point, Rotation
+from envs.manipulation.sawyer.kinematics import Kinematics, Rotation
 from envs.manipulation.scene import TOOL_HALF, TOOL_HEIGHT
 from envs.manipulation.table import CAN_HEIGHT, CAN_RADIUS, Task, distances
 from envs.manipulation.table_scene import TIMESTEP
@@ -38,8 +38,8 @@ RETREAT, RETREAT_SECONDS = 0.015, 0.15
 """After a stroke the tool waits for the can to come to rest, then leaves it backwards before it rises."""
 
 Pose = Float[np.ndarray, "6"]
-"""x, y and z of the tip, the angle of its normal about the vertical, and its lean: a turn about a horizontal axis as the x and y
-of axis times angle."""
+"""x, y and z of the tip, the angle of its normal about the vertical, and its lean: a turn about a horizontal axis, as the x and
+y of axis times angle."""
 
 
 class Plan(NamedTuple):
@@ -85,7 +85,14 @@ class Planner:
         up = self.pose.copy()
         up[2] = max(height, up[2])
         cross = CROSS_SECONDS + max(np.linalg.norm(above[:2] - up[:2]) / SPEED, abs(above[3] - up[3]) / TURN_SPEED)
-        legs = [(up, RISE_SECONDS), (above, cross), (down, RISE_SECONDS), (done, STROKE_SECONDS), (done, HOLD_SECONDS), (back, RETREAT_SECONDS)]
+        legs = [
+            (up, RISE_SECONDS),
+            (above, cross),
+            (down, RISE_SECONDS),
+            (done, STROKE_SECONDS),
+            (done, HOLD_SECONDS),
+            (back, RETREAT_SECONDS),
+        ]
         parts, pose = [], self.pose
         for end, seconds in legs:
             parts.append(pose + _progress(seconds)[:, None] * (end - pose))
@@ -113,8 +120,8 @@ class Planner:
 
 
 def _heading(ahead: Float[np.ndarray, "2"]) -> float:
-    """The angle of a direction along x or y, from -pi / 2 to pi: no turn between two of them brings the last joint to its limit."""
-    return float(np.arctan2(ahead[1] + 0.0, ahead[0]))
+    """The angle of a direction along x or y, from -pi / 2 to pi: so the last joint stays far from its limits."""
+    return float(np.arctan2(ahead[1] + 0.0, ahead[0]))  # -0.0 would give -pi
 
 
 def lean(place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from envs.manipulation.dynamics import GOAL_RADIUS
 from envs.manipulation.push import FALL_COSINE, SUNK, TOOL_RADIUS, TOOL_START
-from envs.manipulation.sawyer.kinematics import JOINTS
+from envs.manipulation.sawyer.kinematics import JOINTS, Joints
 from envs.manipulation.sawyer.motion import Plan, Planner
 from envs.manipulation.sawyer.stage import PREFIX, mirror, stage
 from envs.manipulation.table import ABSENT, CAN_HEIGHT, CAN_RADIUS, CANS, DIRECTIONS, SIZE, TARGET, Task, distances
@@ -126,8 +126,8 @@ class Scene:
         self.goal_joints = plan.joints[step]
         self._advance(plan.joints[step], plan.speeds[step], plan.accelerations[step])
 
-    def _advance(self, joints, speeds, accelerations) -> None:
-        """One time step in which the motors' torque gives the joints the wanted acceleration, and takes back what they are off."""
+    def _advance(self, joints: Joints, speeds: Joints, accelerations: Joints) -> None:
+        """One time step: the torque that gives the joints the wanted accelerations, and takes back what they are off."""
         model, data = self.model, self.data
         mujoco.mj_step1(model, data)
         off = joints - data.qpos[self.positions]
@@ -154,7 +154,7 @@ class Scene:
         """Whether the tool finds room behind a can, as the task space asks."""
         cans = self.cans()
         behind = cans[can] + TOOL_START * ahead
-        others = [np.linalg.norm(cans[other] - behind) - CAN_RADIUS for other in range(CANS) if other != can]
+        others = [float(np.linalg.norm(cans[other] - behind)) - CAN_RADIUS for other in range(CANS) if other != can]
         walls = float(jnp.min(distances(self.task.obstacles, jnp.asarray(behind, jnp.float32))))
         return min(walls, *others) > TOOL_RADIUS
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
-import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
@@ -15,8 +16,8 @@ from envs.manipulation.sawyer.arm import HEIGHT, arm_xml
 from envs.manipulation.table import CANS, CELL, PIT_DEPTH, SIZE, Task
 from envs.manipulation.table_scene import table_xml
 
-BOARD, RIM = 0.03, 0.06
-"""Metres: thickness of the board under the blocks, and how far it reaches beyond them."""
+BOARD, RIM, LEG = 0.03, 0.06, 0.03
+"""Metres: thickness of the board under the blocks, how far it reaches beyond them, and half the thickness of its legs."""
 
 BOARD_COLOR, FLOOR_COLOR = (120, 120, 124), (196, 200, 204)
 
@@ -32,11 +33,16 @@ PICTURE = (480, 360)
 
 def mirror(task: Task) -> Task:
     """The task as the robot sees it: x runs the other way."""
-    task = jax.device_get(task)
     flip, shift = np.array([-1, 1], np.float32), np.array([SIZE[0], 0], np.float32)
-    cans = np.where(task.present[:, None], shift + flip * task.cans, task.cans)
-    obstacles = task.obstacles._replace(center=shift + flip * task.obstacles.center, axis=flip * task.obstacles.axis)
-    return task._replace(ground=task.ground[::-1], obstacles=obstacles, cans=cans, goal=shift + flip * task.goal)
+    obstacles, cans = task.obstacles, np.asarray(task.cans)
+    return task._replace(
+        ground=jnp.asarray(task.ground)[::-1],
+        obstacles=obstacles._replace(
+            center=jnp.asarray(shift + flip * np.asarray(obstacles.center)), axis=jnp.asarray(flip * np.asarray(obstacles.axis))
+        ),
+        cans=jnp.asarray(np.where(np.asarray(task.present)[:, None], shift + flip * cans, cans)),
+        goal=jnp.asarray(shift + flip * np.asarray(task.goal)),
+    )
 
 
 def stage(task: Task, goal: Float[np.ndarray, "2"]) -> mujoco.MjModel:
@@ -48,14 +54,11 @@ def stage(task: Task, goal: Float[np.ndarray, "2"]) -> mujoco.MjModel:
     half = [(size + 2 * RIM) / 2 for size in SIZE]
     center = [size / 2 for size in SIZE]
     box, plane = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE
-    world.add_geom(
-        type=box, pos=[*center, -PIT_DEPTH - BOARD / 2], size=[*half, BOARD / 2], rgba=_opaque(BOARD_COLOR)
-    )
+    world.add_geom(type=box, pos=[*center, -PIT_DEPTH - BOARD / 2], size=[*half, BOARD / 2], rgba=_opaque(BOARD_COLOR))
     legs = HEIGHT - PIT_DEPTH - BOARD
-    for x in (-1, 1):
-        for y in (-1, 1):
-            place = [center[0] + x * (half[0] - 0.04), center[1] + y * (half[1] - 0.04), -HEIGHT + legs / 2]
-            world.add_geom(type=box, pos=place, size=[0.03, 0.03, legs / 2], rgba=_opaque(BOARD_COLOR), contype=0, conaffinity=0)
+    for side, end in itertools.product((-1, 1), repeat=2):
+        place = [center[0] + side * (half[0] - LEG), center[1] + end * (half[1] - LEG), -HEIGHT + legs / 2]
+        world.add_geom(type=box, pos=place, size=[LEG, LEG, legs / 2], rgba=_opaque(BOARD_COLOR), contype=0, conaffinity=0)
     world.add_geom(type=plane, pos=[0, 0, -HEIGHT], size=[0, 0, 1], rgba=_opaque(FLOOR_COLOR))
     for x, y, length in _strips(goal, np.asarray(task.ground)):
         world.add_geom(
