@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from envs.manipulation.push import GAP, STROKE, STROKE_SECONDS
 from envs.manipulation.sawyer.arm import BASE
-from envs.manipulation.sawyer.kinematics import Kinematics, Rotation
+from envs.manipulation.sawyer.kinematics import REST, Kinematics, Rotation
 from envs.manipulation.scene import TOOL_HALF, TOOL_HEIGHT
 from envs.manipulation.table import CAN_HEIGHT, CAN_RADIUS, Task, distances
 from envs.manipulation.table_scene import TIMESTEP
@@ -33,8 +33,10 @@ POINTS = 64
 CROSS_SECONDS, SPEED, TURN_SPEED = 0.2, 0.35, 2.5
 """How long the tool takes to cross the table: seconds however close, and mean metres and radians per second."""
 
-RISE_SECONDS, HOLD_SECONDS = 0.3, 0.15
-RETREAT, RETREAT_SECONDS = 0.015, 0.15
+RISE_SECONDS, RISE_SPEED = 0.3, 0.4
+"""Seconds to rise or sink at least, and mean metres per second at most."""
+
+HOLD_SECONDS, RETREAT, RETREAT_SECONDS = 0.15, 0.015, 0.15
 """After a stroke the tool waits for the can to come to rest, then leaves it backwards before it rises."""
 
 Pose = Float[np.ndarray, "6"]
@@ -58,7 +60,7 @@ class Plan(NamedTuple):
 
 
 class Planner:
-    """Plans one push after the other, each from where the last one ended.
+    """Plans one push after the other, each from where the last one ended, the first from over the table in front of the robot.
 
     Attributes:
       joints: the joints' angles where the next plan starts.
@@ -70,8 +72,7 @@ class Planner:
         self.kinematics = Kinematics()
         start = np.array([BASE[0], BASE[1] + 0.45])
         self.pose = _pose(start, self._clear(start, start), 0.0, lean(start))
-        rest = np.array([0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 1.7])
-        self.joints = self.kinematics.approach(rest, self.pose[:3], rotation(self.pose), iterations=300)
+        self.joints = self.kinematics.approach(REST, self.pose[:3], rotation(self.pose), iterations=300)
 
     def push(self, place: Float[np.ndarray, "2"], ahead: Float[np.ndarray, "2"]) -> Plan:
         """From where the arm is, pushes a can at `place` in the direction `ahead`, which is along x or y."""
@@ -84,11 +85,11 @@ class Planner:
         back = done - np.pad(ahead * RETREAT, (0, 4))
         up = self.pose.copy()
         up[2] = max(height, up[2])
-        cross = CROSS_SECONDS + max(np.linalg.norm(above[:2] - up[:2]) / SPEED, abs(above[3] - up[3]) / TURN_SPEED)
+        cross = CROSS_SECONDS + max(float(np.linalg.norm(above[:2] - up[:2])) / SPEED, abs(above[3] - up[3]) / TURN_SPEED)
         legs = [
-            (up, RISE_SECONDS),
+            (up, max(RISE_SECONDS, (up[2] - self.pose[2]) / RISE_SPEED)),
             (above, cross),
-            (down, RISE_SECONDS),
+            (down, max(RISE_SECONDS, (above[2] - down[2]) / RISE_SPEED)),
             (done, STROKE_SECONDS),
             (done, HOLD_SECONDS),
             (back, RETREAT_SECONDS),

@@ -64,8 +64,8 @@ def stage(task: Task, goal: Float[np.ndarray, "2"]) -> mujoco.MjModel:
         world.add_geom(
             type=box, pos=[x, y, 0], size=[length / 2, STRIP / 2, 0.001], rgba=_opaque(GOAL_COLOR), contype=0, conaffinity=0
         )
-    world.add_light(pos=[center[0] + 0.5, 1.2, 2.0], dir=[-0.25, -0.45, -1.0], diffuse=[0.5, 0.5, 0.5], castshadow=True)
-    world.add_light(pos=[center[0] - 0.8, 1.0, 1.5], dir=[0.4, -0.4, -1.0], diffuse=[0.15, 0.15, 0.15], castshadow=False)
+    lamp = [center[0] + 0.6, center[1] + 1.0, 2.5]
+    world.add_light(pos=lamp, dir=[-0.6, -1.2, -2.5], cutoff=60, exponent=1, diffuse=[0.5, 0.5, 0.5], specular=[0, 0, 0])
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35, 0.35, 0.35], [0.2, 0.2, 0.2]
     spec.visual.global_.offwidth, spec.visual.global_.offheight = PICTURE
     spec.attach(mujoco.MjSpec.from_string(arm_xml()), prefix=PREFIX, frame=world.add_frame())
