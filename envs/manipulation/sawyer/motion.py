@@ -10,16 +10,15 @@ import numpy as np
 from jaxtyping import Float
 
 from envs.manipulation.push import GAP, STROKE, STROKE_SECONDS
-from envs.manipulation.sawyer.arm import BASE
+from envs.manipulation.sawyer.arm import BASE, LINKS
 from envs.manipulation.sawyer.kinematics import REST, Kinematics, Rotation
 from envs.manipulation.scene import TOOL_HALF, TOOL_HEIGHT
 from envs.manipulation.table import CAN_HEIGHT, CAN_RADIUS, Task, distances
 from envs.manipulation.table_scene import TIMESTEP
 
-LEAN_FROM, LEAN_TO = 0.88, 1.03
-LEAN = 0.2
-"""Metres from the robot's axis from which on the tool leans outwards, and to which, by how much in radians: the arm is too
-short to hold it upright everywhere."""
+LEAN_FROM, LEAN_TO, LEAN = 0.7, 1.0, 0.15
+"""Metres from the robot's axis from which on the tool leans outwards and where it leans most, and by how many radians there:
+the arm is too short to hold it upright everywhere.  Leaning more, the stick would touch a can's top."""
 
 SPARE = 0.03
 """Metres between the tool's tip and what it crosses."""
@@ -30,11 +29,11 @@ WIDTH = 0.06
 POINTS = 64
 """Points of a way that are looked at, at most 2 cm apart."""
 
-CROSS_SECONDS, SPEED, TURN_SPEED = 0.2, 0.35, 2.5
-"""How long the tool takes to cross the table: seconds however close, and mean metres and radians per second."""
+RISE_SECONDS, CROSS_SECONDS, CROSS_SPEED = 0.3, 0.2, 0.35
+"""Seconds to rise or sink, and to cross the table: seconds however close, and mean metres per second of the tip."""
 
-RISE_SECONDS, RISE_SPEED = 0.3, 0.4
-"""Seconds to rise or sink at least, and mean metres per second at most."""
+PATIENCE = 1.02
+"""A motion that is too fast for a joint takes this much longer than it seems to need."""
 
 HOLD_SECONDS, RETREAT, RETREAT_SECONDS = 0.15, 0.015, 0.15
 """After a stroke the tool waits for the can to come to rest, then leaves it backwards before it rises."""
@@ -75,7 +74,10 @@ class Planner:
         self.joints = self.kinematics.approach(REST, self.pose[:3], rotation(self.pose), iterations=300)
 
     def push(self, place: Float[np.ndarray, "2"], ahead: Float[np.ndarray, "2"]) -> Plan:
-        """From where the arm is, pushes a can at `place` in the direction `ahead`, which is along x or y."""
+        """From where the arm is, pushes a can at `place` in the direction `ahead`, which is along x or y.
+
+        Joints keep to their limits of position, and of speed but for the stroke, whose time is the task space's.
+        """
         heading, leaning = _heading(ahead), lean(place)
         behind = place - ahead * (CAN_RADIUS + GAP + _extent(heading, leaning, ahead))
         height = self._clear(self.pose[:2], behind)
@@ -85,32 +87,30 @@ class Planner:
         back = done - np.pad(ahead * RETREAT, (0, 4))
         up = self.pose.copy()
         up[2] = max(height, up[2])
-        cross = CROSS_SECONDS + max(float(np.linalg.norm(above[:2] - up[:2])) / SPEED, abs(above[3] - up[3]) / TURN_SPEED)
-        legs = [
-            (up, max(RISE_SECONDS, (up[2] - self.pose[2]) / RISE_SPEED)),
-            (above, cross),
-            (down, max(RISE_SECONDS, (above[2] - down[2]) / RISE_SPEED)),
-            (done, STROKE_SECONDS),
-            (done, HOLD_SECONDS),
-            (back, RETREAT_SECONDS),
-        ]
-        parts, pose = [], self.pose
-        for end, seconds in legs:
-            parts.append(pose + _progress(seconds)[:, None] * (end - pose))
-            pose = end
-        first = sum(len(part) for part in parts[:3])
-        poses = np.concatenate(parts)
-        joints = self._follow(poses)
-        self.pose, self.joints = pose, joints[-1]
+        cross = CROSS_SECONDS + float(np.linalg.norm(above[:2] - up[:2])) / CROSS_SPEED
+        before = [self._move(up, RISE_SECONDS), self._move(above, cross), self._move(down, RISE_SECONDS)]
+        stroke = self._move(done, STROKE_SECONDS, in_time=True)
+        after = [self._move(done, HOLD_SECONDS), self._move(back, RETREAT_SECONDS)]
+        poses, joints = (np.concatenate(parts) for parts in zip(*before, stroke, *after, strict=True))
+        first = sum(len(part) for part, _ in before)
         speeds = np.gradient(joints, TIMESTEP, axis=0)
-        return Plan(joints, speeds, np.gradient(speeds, TIMESTEP, axis=0), poses[:, :3], (first, first + len(parts[3])))
+        accelerations = np.gradient(speeds, TIMESTEP, axis=0)
+        return Plan(joints, speeds, accelerations, poses[:, :3], (first, first + len(stroke[0])))
 
-    def _follow(self, poses: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n 7"]:
-        joints, rows = self.joints, []
+    def _move(
+        self, end: Pose, seconds: float, in_time: bool = False
+    ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 7"]]:
+        """Poses and joint angles on the straight way to a pose; slower where joints would turn too fast, unless `in_time`."""
+        poses = self.pose + _progress(seconds)[:, None] * (end - self.pose)
+        rows = [self.joints]
         for pose in poses:
-            joints = self.kinematics.approach(joints, pose[:3], rotation(pose))
-            rows.append(joints)
-        return np.array(rows)
+            rows.append(self.kinematics.approach(rows[-1], pose[:3], rotation(pose)))
+        joints = np.array(rows)
+        haste = float(np.max(np.abs(np.diff(joints, axis=0)) / TIMESTEP / [link.speed for link in LINKS]))
+        if haste > 1 and not in_time:
+            return self._move(end, seconds * haste * PATIENCE)
+        self.pose, self.joints = end, joints[-1]
+        return poses, joints[1:]
 
     def _clear(self, start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:
         """Height of the tip's centre above cans, and obstacles close to a straight way."""
