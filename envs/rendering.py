@@ -20,8 +20,13 @@ def save_gif(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height width 
     """
     if fps <= 0:
         raise ValueError(f"fps must be positive, got {fps}")
-    images = [Image.fromarray(np.asarray(frame)) for frame in frames]
+    images = [_at_most_256_colors(Image.fromarray(np.asarray(frame))) for frame in frames]
     if not images:
         raise ValueError("a GIF needs at least one frame")
     milliseconds = max(10, round(1000 / fps))
     images[0].save(path, format="GIF", save_all=True, append_images=images[1:], duration=milliseconds, loop=0)
+
+
+def _at_most_256_colors(image: Image.Image) -> Image.Image:
+    """The image, reduced to colours that GIF can hold so that small things keep theirs; Pillow's own choice fades them."""
+    return image if image.getcolors(256) else image.quantize(method=Image.Quantize.FASTOCTREE)

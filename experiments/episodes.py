@@ -1,18 +1,33 @@
-"""Episodes of trained policies: scores and pictures."""
+"""Episodes: scores and pictures of trained policies."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key, UInt8
+from jaxtyping import Array, Int, Key, UInt8
 
 import envs
 from apt_jax import evaluation
 from apt_jax.specs import Obs
 from apt_jax.trainer import Trainer
+
+
+class Episode(NamedTuple):
+    """One episode, fetched.
+
+    Attributes:
+      states: before the first step and after each.
+      actions: one per step.
+      success: whether it ended with success.
+    """
+
+    states: list[Any]
+    actions: list[int]
+    success: bool
 
 
 def score(trainer: Trainer, policies: Any, task: Any, *, episodes: int, key: Key[Array, ""]) -> evaluation.Outcome:
@@ -25,25 +40,31 @@ def score(trainer: Trainer, policies: Any, task: Any, *, episodes: int, key: Key
     return jax.device_get(jax.jit(jax.vmap(play))(policies))
 
 
+def play(
+    space: envs.BenchmarkSpace, task: Any, act: Callable[[Obs, Int[Array, ""]], Int[Array, ""]], key: Key[Array, ""]
+) -> Episode:
+    """One episode of `act(obs, step)`, which says the action of each step, counted from 0; consumes `key`."""
+
+    def advance(carry: tuple[Any, Obs], step: Int[Array, ""]) -> tuple[tuple[Any, Obs], tuple[Any, Array, Array, Array]]:
+        state, obs = carry
+        action = act(obs, step)
+        out = space.step(state, action, task)
+        return (out.state, out.obs), (out.state, action, out.terminated | out.truncated, out.success)
+
+    @jax.jit
+    def rollout(key: Key[Array, ""]) -> tuple[Any, tuple[Any, Array, Array, Array]]:
+        state, obs = space.reset(key, task)
+        return state, jax.lax.scan(advance, (state, obs), jnp.arange(space.horizon))[1]
+
+    first, (states, actions, over, success) = jax.device_get(rollout(key))
+    steps = int(np.argmax(over)) + 1
+    after = [jax.tree.map(lambda x, i=i: x[i], states) for i in range(steps)]
+    return Episode([first, *after], [int(action) for action in actions[:steps]], bool(success[steps - 1]))
+
+
 def film(
     space: envs.BenchmarkSpace, trainer: Trainer, policy: Any, task: Any, key: Key[Array, ""]
 ) -> list[UInt8[np.ndarray, "H W 3"]]:
     """Pictures of one greedy episode, from its first state to its last; consumes `key`."""
-
-    def step(carry: tuple[Any, Obs], _: None) -> tuple[tuple[Any, Obs], tuple[Any, Array]]:
-        state, obs = carry
-        out = space.step(state, trainer.act(policy, obs), task)
-        return (out.state, out.obs), (out.state, out.terminated | out.truncated)
-
-    @jax.jit
-    def rollout(key: Key[Array, ""]) -> tuple[Any, Any, Array]:
-        state, obs = space.reset(key, task)
-        _, (states, over) = jax.lax.scan(step, (state, obs), length=space.horizon)
-        return state, states, over
-
-    first, states, over = jax.device_get(rollout(key))
-    steps = int(np.argmax(over)) + 1
-    return [space.render(task, first)] + [
-        space.render(task, jax.tree.map(lambda x: x[i], states))  # noqa: B023
-        for i in range(steps)
-    ]
+    episode = play(space, task, lambda obs, _: trainer.act(policy, obs), key)
+    return [space.render(task, state) for state in episode.states]

@@ -14,9 +14,8 @@ from jax.sharding import SingleDeviceSharding
 from rich.console import Console
 from rich.table import Table
 
-import envs.rendering
 from apt_jax.evaluation import Outcome
-from experiments import episodes, runtime, settings
+from experiments import episodes, film, runtime, settings
 from experiments.errors import UsageError, exit_with
 from experiments.problem import make_problem
 from experiments.run_dir import RunDir
@@ -34,6 +33,7 @@ class Args:
       episodes: greedy episodes per lane.
       seed: of the episodes' initial states.
       gif: where to put a film of the best lane.
+      robot: have the Sawyer arm play the film's episode, in Manipulation (see experiments.film).
     """
 
     run_dir: Path
@@ -42,6 +42,7 @@ class Args:
     episodes: int = 50
     seed: int = 0
     gif: Path | None = None
+    robot: bool = False
 
 
 def main() -> int:
@@ -57,6 +58,8 @@ def evaluate(args: Args) -> None:
     if args.episodes < 1:
         raise UsageError(f"--episodes must be at least 1, got {args.episodes}")
     experiment = settings.load(args.run_dir)
+    if args.robot:
+        film.check_robot(experiment.space)
     if args.target or args.target_file:
         experiment = dataclasses.replace(experiment, target=args.target or experiment.target, target_file=args.target_file)
     problem = make_problem(experiment)
@@ -75,7 +78,8 @@ def evaluate(args: Args) -> None:
     if args.gif:
         best = int(np.argmax(outcome.episode_return.mean(axis=1)))
         policy = jax.tree.map(lambda x: x[best], policies)
-        envs.rendering.save_gif(args.gif, episodes.film(problem.space, problem.trainer, policy, problem.target, key_film))
+        episode = episodes.play(problem.space, problem.target, lambda obs, _: problem.trainer.act(policy, obs), key_film)
+        film.save(args.gif, problem.space, problem.target, episode, robot=args.robot)
 
 
 def _print(lanes: Sequence[str], outcome: Outcome, title: str) -> None:

@@ -1,0 +1,5 @@
+"""Episodes of Manipulation played by a Sawyer arm in MuJoCo, with every shape and contact as it is, and filmed.
+
+What the robot sees: it stands at y < 0 and looks along y, so x runs to its right.  A task's x runs to the right of someone who
+faces the robot; `stage.mirror` takes one to the other, and everything below it is as the robot sees it.
+"""

@@ -1,0 +1,79 @@
+"""Where the tool's tip is, and the joint angles that bring it to a pose, by damped least squares (Wampler 1986)."""
+
+from __future__ import annotations
+
+import functools
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from envs.manipulation.sawyer.arm import LINKS, arm_xml
+
+JOINTS = len(LINKS)
+
+DAMPING = 1e-3
+"""Weight of the joints' motion against the pose's error, where a metre counts as much as a radian."""
+
+REST = np.array([0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 1.0])
+"""The arm's neutral pose, elbow up and hand down: where the one freedom that a pose leaves is drawn to."""
+
+EASE = 0.02
+"""Share of the way to `REST` per iteration."""
+
+CLOSE = 1e-6
+
+Joints = Float[np.ndarray, "7"]
+Point = Float[np.ndarray, "3"]
+Rotation = Float[np.ndarray, "3 3"]
+
+
+@functools.cache
+def arm_model() -> mujoco.MjModel:
+    """The robot without a table."""
+    return mujoco.MjModel.from_xml_string(arm_xml())
+
+
+@functools.cache
+def limits() -> Float[np.ndarray, "7 2"]:
+    """Lower and upper limit of each joint, in radians."""
+    return np.array([link.limits for link in LINKS])
+
+
+class Kinematics:
+    """The arm's geometry at one posture at a time."""
+
+    def __init__(self) -> None:
+        self.model = arm_model()
+        self.data = mujoco.MjData(self.model)
+        self.tip = self.model.site("tip").id
+
+    def pose(self, joints: Joints) -> tuple[Point, Rotation]:
+        """Place of the tip, in metres, and the rotation that takes its axes to the world's."""
+        self.data.qpos[:] = joints
+        mujoco.mj_kinematics(self.model, self.data)
+        return self.data.site_xpos[self.tip].copy(), self.data.site_xmat[self.tip].reshape(3, 3).copy()
+
+    def approach(self, joints: Joints, point: Point, rotation: Rotation, iterations: int = 1) -> Joints:
+        """Joint angles closer to a pose of the tip, never beyond the joints' limits."""
+        for _ in range(iterations):
+            error = np.concatenate(self._error(joints, point, rotation))
+            if iterations > 1 and np.abs(error).max() < CLOSE:
+                break
+            mujoco.mj_comPos(self.model, self.data)
+            jacobian = np.empty((6, JOINTS))
+            mujoco.mj_jacSite(self.model, self.data, jacobian[:3], jacobian[3:], self.tip)
+            inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + DAMPING**2 * np.eye(6))
+            ease = EASE * (REST - joints)
+            ease[6] = 0.0
+            joints = np.clip(joints + inverse @ error + ease - inverse @ (jacobian @ ease), *limits().T)
+        return joints
+
+    def _error(self, joints: Joints, point: Point, rotation: Rotation) -> tuple[Point, Point]:
+        """What is missing to a pose: a translation, and a turn as axis times angle."""
+        at, turned = self.pose(joints)
+        turn = np.empty(3)
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, (rotation @ turned.T).ravel())
+        mujoco.mju_quat2Vel(turn, quaternion, 1.0)
+        return point - at, turn

@@ -1,0 +1,165 @@
+"""How the arm moves: over the table to behind a can, the stroke of the task space's push, and back off."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from envs.manipulation.push import GAP, STROKE, STROKE_SECONDS
+from envs.manipulation.sawyer.arm import BASE, LINKS
+from envs.manipulation.sawyer.kinematics import REST, Kinematics, Rotation
+from envs.manipulation.scene import TOOL_HALF, TOOL_HEIGHT
+from envs.manipulation.table import CAN_HEIGHT, CAN_RADIUS, Task, distances
+from envs.manipulation.table_scene import TIMESTEP
+
+LEAN_FROM, LEAN_TO, LEAN = 0.7, 1.0, 0.15
+"""Metres from the robot's axis from which on the tool leans outwards and where it leans most, and by how many radians there:
+the arm is too short to hold it upright everywhere.  Leaning more, the stick would touch a can's top."""
+
+SPARE = 0.03
+"""Metres between the tool's tip and what it crosses."""
+
+WIDTH = 0.06
+"""Metres beside its way within which the tool keeps above everything."""
+
+POINTS = 64
+"""Points of a way that are looked at, at most 2 cm apart."""
+
+RISE_SECONDS, CROSS_SECONDS, CROSS_SPEED = 0.3, 0.2, 0.35
+"""Seconds to rise or sink, and to cross the table: seconds however close, and mean metres per second of the tip."""
+
+PATIENCE = 1.02
+"""A motion that is too fast for a joint takes this much longer than it seems to need."""
+
+HOLD_SECONDS, RETREAT, RETREAT_SECONDS = 0.15, 0.015, 0.15
+"""After a stroke the tool waits for the can to come to rest, then leaves it backwards before it rises."""
+
+Pose = Float[np.ndarray, "6"]
+"""x, y and z of the tip, the angle of its normal about the vertical, and its lean: a turn about a horizontal axis, as the x and
+y of axis times angle."""
+
+
+class Plan(NamedTuple):
+    """Joint angles of a motion, one row per time step, with speeds and accelerations.
+
+    Attributes:
+      stroke: first and one past the last time step of the stroke.
+      points: where the tip is meant to be.
+    """
+
+    joints: Float[np.ndarray, "n 7"]
+    speeds: Float[np.ndarray, "n 7"]
+    accelerations: Float[np.ndarray, "n 7"]
+    points: Float[np.ndarray, "n 3"]
+    stroke: tuple[int, int]
+
+
+class Planner:
+    """Plans one push after the other, each from where the last one ended, the first from over the table in front of the robot.
+
+    Attributes:
+      joints: the joints' angles where the next plan starts.
+      pose: the tip's pose there.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.kinematics = Kinematics()
+        start = np.array([BASE[0], BASE[1] + 0.45])
+        self.pose = _pose(start, self._clear(start, start), 0.0, lean(start))
+        self.joints = self.kinematics.approach(REST, self.pose[:3], rotation(self.pose), iterations=300)
+
+    def push(self, place: Float[np.ndarray, "2"], ahead: Float[np.ndarray, "2"]) -> Plan:
+        """From where the arm is, pushes a can at `place` in the direction `ahead`, which is along x or y.
+
+        Joints keep to their limits of position, and of speed but for the stroke, whose time is the task space's.
+        """
+        heading, leaning = _heading(ahead), lean(place)
+        behind = place - ahead * (CAN_RADIUS + GAP + _extent(heading, leaning, ahead))
+        height = self._clear(self.pose[:2], behind)
+        above = _pose(behind, height, heading, leaning)
+        down = _pose(behind, TOOL_HEIGHT, heading, leaning)
+        done = down + np.pad(ahead * (STROKE + GAP), (0, 4))
+        back = done - np.pad(ahead * RETREAT, (0, 4))
+        up = self.pose.copy()
+        up[2] = max(height, up[2])
+        cross = CROSS_SECONDS + float(np.linalg.norm(above[:2] - up[:2])) / CROSS_SPEED
+        before = [self._move(up, RISE_SECONDS), self._move(above, cross), self._move(down, RISE_SECONDS)]
+        stroke = self._move(done, STROKE_SECONDS, in_time=True)
+        after = [self._move(done, HOLD_SECONDS), self._move(back, RETREAT_SECONDS)]
+        poses, joints = (np.concatenate(parts) for parts in zip(*before, stroke, *after, strict=True))
+        first = sum(len(part) for part, _ in before)
+        speeds = np.gradient(joints, TIMESTEP, axis=0)
+        accelerations = np.gradient(speeds, TIMESTEP, axis=0)
+        return Plan(joints, speeds, accelerations, poses[:, :3], (first, first + len(stroke[0])))
+
+    def _move(
+        self, end: Pose, seconds: float, in_time: bool = False
+    ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 7"]]:
+        """Poses and joint angles on the straight way to a pose; slower where joints would turn too fast, unless `in_time`."""
+        poses = self.pose + _progress(seconds)[:, None] * (end - self.pose)
+        rows = [self.joints]
+        for pose in poses:
+            rows.append(self.kinematics.approach(rows[-1], pose[:3], rotation(pose)))
+        joints = np.array(rows)
+        haste = float(np.max(np.abs(np.diff(joints, axis=0)) / TIMESTEP / [link.speed for link in LINKS]))
+        if haste > 1 and not in_time:
+            return self._move(end, seconds * haste * PATIENCE)
+        self.pose, self.joints = end, joints[-1]
+        return poses, joints[1:]
+
+    def _clear(self, start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:
+        """Height of the tip's centre above cans, and obstacles close to a straight way."""
+        way = jnp.asarray(np.linspace(start, end, POINTS), jnp.float32)
+        near = np.asarray(jax.vmap(distances, in_axes=(None, 0))(self.task.obstacles, way)) < WIDTH
+        highest = float(np.max(np.where(near, self.task.obstacles.height, 0.0)))
+        return max(highest, CAN_HEIGHT) + SPARE + TOOL_HALF[2]
+
+
+def _heading(ahead: Float[np.ndarray, "2"]) -> float:
+    """The angle of a direction along x or y, from -pi / 2 to pi: so the last joint stays far from its limits."""
+    return float(np.arctan2(ahead[1] + 0.0, ahead[0]))  # -0.0 would give -pi
+
+
+def lean(place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+    """Lean of the tool for a push from `place`: away from the robot, the more the farther."""
+    outwards = place - np.array(BASE)
+    far = float(np.linalg.norm(outwards))
+    angle = LEAN * np.clip((far - LEAN_FROM) / (LEAN_TO - LEAN_FROM), 0, 1)
+    x, y = outwards / far
+    turned: Float[np.ndarray, "2"] = angle * np.array([y, -x])
+    return turned
+
+
+def rotation(pose: Pose) -> Rotation:
+    """From the tip's axes to the world's: z down along the stick, x its normal, both turned by the lean."""
+    cosine, sine = np.cos(pose[3]), np.sin(pose[3])
+    upright = np.array([[cosine, sine, 0], [sine, -cosine, 0], [0, 0, -1]])
+    angle = float(np.hypot(pose[4], pose[5]))
+    if angle == 0:
+        return upright
+    x, y = pose[4:] / angle
+    cross = np.array([[0, 0, y], [0, 0, -x], [-y, x, 0]])
+    turn: Rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return turn @ upright
+
+
+def _pose(place: Float[np.ndarray, "2"], height: float, heading: float, leaning: Float[np.ndarray, "2"]) -> Pose:
+    return np.array([*place, height, heading, *leaning])
+
+
+def _extent(heading: float, leaning: Float[np.ndarray, "2"], ahead: Float[np.ndarray, "2"]) -> float:
+    """How far the tip reaches beyond its centre."""
+    turned = rotation(_pose(ahead, 0.0, heading, leaning))
+    return float(np.abs(np.array([*ahead, 0]) @ turned) @ np.array(TOOL_HALF))
+
+
+def _progress(seconds: float) -> Float[np.ndarray, "n"]:
+    """Share of the way gone after each time step: half a period of a cosine, as in the task space's stroke."""
+    steps = round(seconds / TIMESTEP)
+    shares: Float[np.ndarray, "n"] = (1 - np.cos(np.pi * np.arange(1, steps + 1) / steps)) / 2
+    return shares

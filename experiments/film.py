@@ -1,0 +1,100 @@
+"""A film of a target's solution, played by the Sawyer arm: `python -m experiments.film --out FILE --target B`."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+import envs
+import envs.rendering
+from envs.manipulation import Space
+from envs.manipulation.solver import solve
+from envs.manipulation.targets import DEMONSTRATIONS
+from experiments import episodes, runtime
+from experiments.episodes import Episode
+from experiments.errors import UsageError, exit_with
+from experiments.problem import load_target
+
+FPS = 2.0
+"""Pushes per second of a film without the robot."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Film the Sawyer arm solving a target of Manipulation; from above where this machine cannot draw the arm.
+
+    Attributes:
+      out: the GIF to write.
+      target: a target's name.
+      target_file: a file that describes the target task, instead of a name.
+      seed: of the goal's place.
+      above: show the table from above, one picture per push, in any case.
+    """
+
+    out: Path
+    target: str = "A"
+    target_file: Path | None = None
+    seed: int = 0
+    above: bool = False
+
+
+def main() -> int:
+    """The command line."""
+    args = tyro.cli(Args, prog="python -m experiments.film")
+    runtime.setup()
+    film(args)
+    return 0
+
+
+def film(args: Args) -> None:
+    """Writes a film of a shortest solution: the known one of a named target, else one that is searched for."""
+    if not args.out.parent.is_dir():
+        raise UsageError(f"{args.out.parent} is no directory")
+    space = Space()
+    task = load_target(space.name, args.target, args.target_file)
+    actions = solve(task, space.goal_jitter) if args.target_file else DEMONSTRATIONS[args.target]
+    if actions is None:
+        raise UsageError(f"{args.target_file}: found no solution to film")
+    sequence = jnp.asarray(actions)
+    episode = episodes.play(space, task, lambda _, step: sequence[step], jax.random.key(args.seed))
+    save(args.out, space, task, episode, robot=not args.above)
+
+
+def check_robot(space: str) -> None:
+    """Raises a `UsageError` unless the arm plays a space."""
+    if space != Space.name:
+        raise UsageError(f"the robot plays {Space.name}, not {space}")
+
+
+def save(out: Path, space: envs.BenchmarkSpace, task: Any, episode: Episode, *, robot: bool) -> None:
+    """Writes a film of an episode, played by the robot if asked for and this machine can draw it, else from above."""
+    if robot and _save_robot(out, task, episode):
+        return
+    envs.rendering.save_gif(out, [space.render(task, state) for state in episode.states], FPS)
+
+
+def _save_robot(out: Path, task: Any, episode: Episode) -> bool:
+    """Whether it could be drawn; tells how the arm fared, whose cans go their own way."""
+    from envs.manipulation.sawyer import film as sawyer  # needs MuJoCo's own engine, which nothing else here does
+    from envs.manipulation.sawyer.camera import NoGraphics
+
+    try:
+        frames, pushes = sawyer.film(task, np.asarray(episode.states[0].goal, float), episode.actions)
+    except NoGraphics as error:
+        print(f"{error}; the film shows the table from above", file=sys.stderr)
+        return False
+    outcome = "success" if pushes[-1].success else pushes[-1].event or "no success"
+    print(f"the arm: {outcome} after {len(pushes)} pushes")
+    envs.rendering.save_gif(out, frames, sawyer.FPS)
+    return True
+
+
+if __name__ == "__main__":
+    exit_with(main)
