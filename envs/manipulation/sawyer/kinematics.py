@@ -22,6 +22,9 @@ EASE = 0.02
 """Share of the way to `REST` per iteration."""
 
 CLOSE = 1e-6
+"""Metres and radians that end the iterations."""
+
+IDENTITY = np.eye(6)
 
 Joints = Float[np.ndarray, "7"]
 Point = Float[np.ndarray, "3"]
@@ -55,7 +58,7 @@ class Kinematics:
         return self.data.site_xpos[self.tip].copy(), self.data.site_xmat[self.tip].reshape(3, 3).copy()
 
     def approach(self, joints: Joints, point: Point, rotation: Rotation, iterations: int = 1) -> Joints:
-        """Joint angles closer to a pose of the tip, never beyond the joints' limits."""
+        """Joint angles closer to a pose of the tip, never beyond the joints' limits; the last one is not drawn to `REST`."""
         for _ in range(iterations):
             error = np.concatenate(self._error(joints, point, rotation))
             if iterations > 1 and np.abs(error).max() < CLOSE:
@@ -63,10 +66,10 @@ class Kinematics:
             mujoco.mj_comPos(self.model, self.data)
             jacobian = np.empty((6, JOINTS))
             mujoco.mj_jacSite(self.model, self.data, jacobian[:3], jacobian[3:], self.tip)
-            inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + DAMPING**2 * np.eye(6))
             ease = EASE * (REST - joints)
             ease[6] = 0.0
-            joints = np.clip(joints + inverse @ error + ease - inverse @ (jacobian @ ease), *limits().T)
+            damped = np.linalg.solve(jacobian @ jacobian.T + DAMPING**2 * IDENTITY, error - jacobian @ ease)
+            joints = np.clip(joints + ease + jacobian.T @ damped, *limits().T)
         return joints
 
     def _error(self, joints: Joints, point: Point, rotation: Rotation) -> tuple[Point, Point]:

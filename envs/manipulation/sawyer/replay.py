@@ -14,8 +14,8 @@ from envs.manipulation.dynamics import GOAL_RADIUS
 from envs.manipulation.push import FALL_COSINE, SUNK, TOOL_RADIUS, TOOL_START
 from envs.manipulation.sawyer.kinematics import JOINTS, Joints
 from envs.manipulation.sawyer.motion import Plan, Planner
-from envs.manipulation.sawyer.stage import PREFIX, mirror, stage
-from envs.manipulation.table import ABSENT, CAN_HEIGHT, CAN_RADIUS, CANS, DIRECTIONS, SIZE, TARGET, Task, distances
+from envs.manipulation.sawyer.stage import PREFIX, mirror, mirror_places, stage
+from envs.manipulation.table import ABSENT, CAN_HEIGHT, CAN_RADIUS, CANS, DIRECTIONS, TARGET, Task, distances
 
 STIFFNESS, RESISTANCE = 9e4, 600.0
 """Acceleration of a joint per radian it is off (1/s^2) and per radian per second (1/s): critically damped, 3 ms."""
@@ -54,12 +54,12 @@ def replay(task: Task, goal: Float[np.ndarray, "2"], actions: Sequence[int], wat
     Args:
       goal: (x, y) of the goal's centre.
     """
-    scene = Scene(mirror(task), _mirrored(np.asarray(goal, float)), watch)
+    scene = Scene(mirror(task), mirror_places(np.asarray(goal, float)), watch)
     pushes: list[Push] = []
     for action in actions:
         can, direction = divmod(int(action), len(DIRECTIONS))
         event, tracking = scene.push(can, DIRECTIONS[direction].astype(float) * (-1, 1))
-        cans = np.where(scene.task.present[:, None], _mirrored(scene.cans()), ABSENT)
+        cans = np.where(scene.task.present[:, None], mirror_places(scene.cans()), ABSENT)
         inside = bool(scene.task.present[TARGET]) and float(np.linalg.norm(cans[TARGET] - goal)) < GOAL_RADIUS
         pushes.append(Push(cans, event, not event and inside, tracking))
         if event or pushes[-1].success:
@@ -82,6 +82,11 @@ class Scene:
         self.dofs = np.array([joint.dofadr[0] for joint in joints])
         self.motors = np.array([self.model.actuator(f"{PREFIX}right_j{index}").id for index in range(JOINTS)])
         self.tip = self.model.site(f"{PREFIX}tip").id
+        there = [can for can in range(CANS) if task.present[can]]
+        self.bodies = {can: self.model.body(f"can{can}").id for can in there}
+        self.geoms = {can: self.model.geom(f"can{can}").id for can in there}
+        names = [self.model.geom(geom).name for geom in range(self.model.ngeom)]
+        self.fatal = {geom for geom, name in enumerate(names) if name.startswith(("obstacle", "can"))}
         self.goal_joints = self.planner.joints
         self.data.qpos[self.positions] = self.goal_joints
         mujoco.mj_forward(self.model, self.data)
@@ -90,12 +95,12 @@ class Scene:
 
     def cans(self) -> Float[np.ndarray, "3 2"]:
         """Where the cans are; `ABSENT` those that are not."""
-        places = [self.data.body(f"can{can}").xpos[:2] if self.task.present[can] else (ABSENT, ABSENT) for can in range(CANS)]
+        places = [self.data.xpos[self.bodies[can]][:2] if can in self.bodies else (ABSENT, ABSENT) for can in range(CANS)]
         return np.array(places)
 
     def push(self, can: int, ahead: Float[np.ndarray, "2"]) -> tuple[str, float]:
         """The event and the tracking error of one push, see `Push`; the simulation stops at the event."""
-        if not self.task.present[can] or not self._room(can, ahead):
+        if can not in self.bodies or not self._room(can, ahead):
             return "", 0.0
         plan = self.planner.push(self.cans()[can], ahead)
         tracking = 0.0
@@ -141,14 +146,12 @@ class Scene:
             self.watch(model, data)
 
     def _event(self, can: int) -> str:
-        body, geom = self.model.body(f"can{can}").id, self.model.geom(f"can{can}").id
+        body, geom = self.bodies[can], self.geoms[can]
         if self.data.xpos[body][2] < CAN_HEIGHT / 2 - SUNK or self.data.xmat[body][8] < FALL_COSINE:
             return "fell"
         touching = self.data.contact.geom[self.data.contact.dist <= 0]
-        for other in touching[(touching == geom).any(axis=1)].ravel():
-            if other != geom and self.model.geom(other).name.startswith(("obstacle", "can")):
-                return "hit"
-        return ""
+        met = set(touching[(touching == geom).any(axis=1)].ravel().tolist())
+        return "hit" if met & (self.fatal - {geom}) else ""
 
     def _room(self, can: int, ahead: Float[np.ndarray, "2"]) -> bool:
         """Whether the tool finds room behind a can, as the task space asks."""
@@ -157,7 +160,3 @@ class Scene:
         others = [float(np.linalg.norm(cans[other] - behind)) - CAN_RADIUS for other in range(CANS) if other != can]
         walls = float(jnp.min(distances(self.task.obstacles, jnp.asarray(behind, jnp.float32))))
         return min(walls, *others) > TOOL_RADIUS
-
-
-def _mirrored(places: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-    return places * (-1, 1) + (SIZE[0], 0)

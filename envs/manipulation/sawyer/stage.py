@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
 from envs.manipulation.dynamics import GOAL_RADIUS
 from envs.manipulation.render import CAN_COLORS, GOAL_COLOR, LOW, SURFACE
@@ -33,16 +34,22 @@ PICTURE = (480, 360)
 
 def mirror(task: Task) -> Task:
     """The task as the robot sees it: x runs the other way."""
-    flip, shift = np.array([-1, 1], np.float32), np.array([SIZE[0], 0], np.float32)
     obstacles, cans = task.obstacles, np.asarray(task.cans)
+    axis = np.asarray(obstacles.axis) * np.array([-1, 1], np.float32)
     return task._replace(
         ground=jnp.asarray(task.ground)[::-1],
         obstacles=obstacles._replace(
-            center=jnp.asarray(shift + flip * np.asarray(obstacles.center)), axis=jnp.asarray(flip * np.asarray(obstacles.axis))
+            center=jnp.asarray(mirror_places(obstacles.center), jnp.float32), axis=jnp.asarray(axis, jnp.float32)
         ),
-        cans=jnp.asarray(np.where(np.asarray(task.present)[:, None], shift + flip * cans, cans)),
-        goal=jnp.asarray(shift + flip * np.asarray(task.goal)),
+        cans=jnp.asarray(np.where(np.asarray(task.present)[:, None], mirror_places(cans), cans), jnp.float32),
+        goal=jnp.asarray(mirror_places(task.goal), jnp.float32),
     )
+
+
+def mirror_places(places: ArrayLike) -> Float[np.ndarray, "*n 2"]:
+    """(x, y) of a task as the robot sees them, and the other way round."""
+    turned: Float[np.ndarray, "*n 2"] = np.asarray(places, float) * (-1, 1) + (SIZE[0], 0)
+    return turned
 
 
 def stage(task: Task, goal: Float[np.ndarray, "2"]) -> mujoco.MjModel:
