@@ -182,8 +182,8 @@ def test_a_bonus_widens_the_clip_to_its_own_returns():
 
 
 def test_hyper_parameter_lanes_equal_separate_runs():
-    lanes = [HParams(delta=0.1, gamma=0.9), HParams(delta=0.9, gamma=0.5)]
-    several, _, _ = run(config("apt_gen"), [1, 1], hparams=lanes, layout="vmap")
+    lanes = [HParams(delta=0.1, gamma=0.9), HParams(delta=0.9, gamma=0.5), HParams(learning_rate=1e-3)]
+    several, _, _ = run(config("apt_gen"), [1, 1, 1], hparams=lanes, layout="vmap")
     for lane, hparams in enumerate(lanes):
         alone, _, _ = run(config("apt_gen"), [1], hparams=[hparams])
         assert_lane_equal(several, lane, alone)
@@ -197,12 +197,10 @@ def test_seeds_differ():
     assert all(not np.array_equal(k[0], k[1]) for k in kernels)
 
 
-@pytest.mark.parametrize(
-    ("method", "switches"), [("apt_gen", {}), ("alp_gmm", SWITCHES), ("goal_gan", SWITCHES), ("ride", SWITCHES)]
-)
-def test_nothing_compiles_after_the_first_chunk(method, switches):
+@pytest.mark.parametrize("method", ["apt_gen", "alp_gmm", "goal_gan", "ride"])
+def test_nothing_compiles_after_the_first_chunk(method):
     """Neither in a longer run, nor for other seeds or hyper-parameters."""
-    cfg = config(method, **switches)
+    cfg = config(method, **SWITCHES)
     run(cfg, [0, 1], chunks=1)
     compiled = []
     jax.monitoring.register_event_duration_secs_listener(
@@ -223,10 +221,10 @@ def test_states_are_donated():
 
 
 def test_evaluating_more_often_changes_nothing_in_training():
-    often, _, _ = run(config("apt_gen", eval_every=20), [2], chunks=4)
-    seldom, _, _ = run(config("apt_gen", eval_every=80), [2], chunks=1)
+    often, _, _ = run(config("random", eval_every=20), [2, 3], chunks=4)
+    seldom, _, _ = run(config("random", eval_every=80), [2, 3], chunks=1)
     # A restore would be such a change by intent; the corridor's target is not solved this early.
-    assert float(often.kept.score[0]) < 0
+    assert (np.asarray(often.kept.score) < 0).all()
     for a, b in zip(leaves(often.replay), leaves(seldom.replay), strict=True):
         np.testing.assert_array_equal(a, b)
 
