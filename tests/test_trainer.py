@@ -182,7 +182,7 @@ def test_a_bonus_widens_the_clip_to_its_own_returns():
 
 
 def test_hyper_parameter_lanes_equal_separate_runs():
-    lanes = [HParams(delta=0.1, gamma=0.9), HParams(delta=0.9, gamma=0.5), HParams(learning_rate=1e-3)]
+    lanes = [HParams(delta=0.1, gamma=0.9), HParams(delta=0.9, gamma=0.5), HParams(learning_rate=1e-4)]
     several, _, _ = run(config("apt_gen"), [1, 1, 1], hparams=lanes, layout="vmap")
     for lane, hparams in enumerate(lanes):
         alone, _, _ = run(config("apt_gen"), [1], hparams=[hparams])
@@ -221,10 +221,11 @@ def test_states_are_donated():
 
 
 def test_evaluating_more_often_changes_nothing_in_training():
-    often, _, _ = run(config("random", eval_every=20), [2, 3], chunks=4)
-    seldom, _, _ = run(config("random", eval_every=80), [2, 3], chunks=1)
-    # A restore would be such a change by intent; the corridor's target is not solved this early.
-    assert (np.asarray(often.kept.score) < 0).all()
+    slow = [HParams(learning_rate=1e-5)] * 2
+    often, _, history = run(config("random", eval_every=20), [2, 3], chunks=4, hparams=slow)
+    seldom, _, _ = run(config("random", eval_every=80), [2, 3], chunks=1, hparams=slow)
+    # A restore would be such a change by intent, and needs a target that is solved.
+    assert not np.any([metrics["restored"] for metrics in history])
     for a, b in zip(leaves(often.replay), leaves(seldom.replay), strict=True):
         np.testing.assert_array_equal(a, b)
 
