@@ -105,13 +105,21 @@ def check_joints(plan):
 
 
 class TestMotion:
-    @pytest.mark.parametrize("place", [(0.01, 0.01), (0.45, 0.0), (0.01, 0.59), (0.89, 0.59), (0.45, 0.3)])
+    @pytest.mark.parametrize("place", [(0.01, 0.01), (0.45, 0.0), (0.03, 0.57), (0.87, 0.57), (0.45, 0.3)])
     def test_cans_anywhere_are_in_reach_from_all_sides(self, place):
         planner = motion.Planner(table((45, 30)))
         for ahead in DIRECTIONS:
             plan = planner.push(np.array(place), ahead.astype(float))
             assert off_course(plan) < 1e-3
             check_joints(plan)
+            assert len(plan.joints) * table_scene.TIMESTEP < 8
+
+    @pytest.mark.parametrize("place", [(0.841, 0.518), (0.069, 0.534)])
+    def test_the_far_row_is_reached_at_once_from_rest(self, place):
+        """Where a stretched elbow would flip, no patience keeps it within its speed."""
+        plan = motion.Planner(table((45, 30))).push(np.array(place), np.array([0.0, -1.0]))
+        check_joints(plan)
+        assert len(plan.joints) * table_scene.TIMESTEP < 8
 
     def test_the_stroke_is_that_of_the_task_space(self):
         plan = motion.Planner(table((45, 30))).push(np.array([0.45, 0.3]), np.array([0.0, 1.0]))

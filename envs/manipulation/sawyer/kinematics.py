@@ -15,11 +15,15 @@ JOINTS = len(LINKS)
 DAMPING = 1e-3
 """Weight of the joints' motion against the pose's error, where a metre counts as much as a radian."""
 
-REST = np.array([0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 1.0])
-"""The arm's neutral pose, elbow up and hand down: where the one freedom that a pose leaves is drawn to."""
+REST = np.array([0.0, -1.18, 0.3, 2.18, -0.3, 0.57, 1.0])
+"""The robot's neutral pose, hand down, with the elbow swung aside: where the one freedom that a pose leaves is drawn to.  With
+the elbow straight up, the arm would be stretched out before its hand is over the far corners."""
 
-EASE = 0.02
-"""Share of the way to `REST` per iteration."""
+SPEEDS = np.array([link.speed for link in LINKS])
+"""Radians per second of each joint, at most."""
+
+EASE, MOST_EASE = 0.02, 2e-4 * SPEEDS
+"""Share of the way to `REST` per iteration, and radians at most: a fifth of the speed limits, at 1000 iterations a second."""
 
 CLOSE = 1e-6
 """Metres and radians that end the iterations."""
@@ -66,7 +70,7 @@ class Kinematics:
             mujoco.mj_comPos(self.model, self.data)
             jacobian = np.empty((6, JOINTS))
             mujoco.mj_jacSite(self.model, self.data, jacobian[:3], jacobian[3:], self.tip)
-            ease = EASE * (REST - joints)
+            ease = np.clip(EASE * (REST - joints), -MOST_EASE, MOST_EASE)
             ease[6] = 0.0
             damped = np.linalg.solve(jacobian @ jacobian.T + DAMPING**2 * IDENTITY, error - jacobian @ ease)
             joints = np.clip(joints + ease + jacobian.T @ damped, *limits().T)

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from envs.manipulation.push import GAP, STROKE, STROKE_SECONDS
-from envs.manipulation.sawyer.arm import BASE, LINKS
-from envs.manipulation.sawyer.kinematics import REST, Kinematics, Rotation
+from envs.manipulation.sawyer.arm import BASE
+from envs.manipulation.sawyer.kinematics import REST, SPEEDS, Kinematics, Rotation
 from envs.manipulation.scene import TOOL_HALF, TOOL_HEIGHT
 from envs.manipulation.table import CAN_HEIGHT, CAN_RADIUS, Task, distances
 from envs.manipulation.table_scene import TIMESTEP
@@ -32,8 +32,9 @@ POINTS = 64
 RISE_SECONDS, CROSS_SECONDS, CROSS_SPEED = 0.3, 0.2, 0.35
 """Seconds to rise or sink, and to cross the table: seconds however close, and mean metres per second of the tip."""
 
-PATIENCE = 1.02
-"""A motion that is too fast for a joint takes this much longer than it seems to need."""
+ATTEMPTS, PATIENCE, MOST_PATIENCE = 5, 1.02, 2.0
+"""How often a motion that is too fast for a joint is tried again, how much longer it takes each time than it seems to need, and
+how much longer at most: where the arm is stretched out, a joint may turn fast however slow the tip is."""
 
 HOLD_SECONDS, RETREAT, RETREAT_SECONDS = 0.15, 0.015, 0.15
 """After a stroke the tool waits for the can to come to rest, then leaves it backwards before it rises."""
@@ -101,16 +102,24 @@ class Planner:
         self, end: Pose, seconds: float, in_time: bool = False
     ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 7"]]:
         """Poses and joint angles on the straight way to a pose; slower where joints would turn too fast, unless `in_time`."""
+        poses, joints, haste = self._follow(end, seconds)
+        for _ in range(ATTEMPTS):
+            if haste <= 1 or in_time:
+                break
+            seconds *= min(haste * PATIENCE, MOST_PATIENCE)
+            poses, joints, haste = self._follow(end, seconds)
+        self.pose, self.joints = end, joints[-1]
+        return poses, joints
+
+    def _follow(self, end: Pose, seconds: float) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 7"], float]:
+        """Poses, joint angles, and how many times too fast a joint turns at most."""
         poses = self.pose + _progress(seconds)[:, None] * (end - self.pose)
         rows = [self.joints]
         for pose in poses:
             rows.append(self.kinematics.approach(rows[-1], pose[:3], rotation(pose)))
         joints = np.array(rows)
-        haste = float(np.max(np.abs(np.diff(joints, axis=0)) / TIMESTEP / [link.speed for link in LINKS]))
-        if haste > 1 and not in_time:
-            return self._move(end, seconds * haste * PATIENCE)
-        self.pose, self.joints = end, joints[-1]
-        return poses, joints[1:]
+        haste = np.max(np.abs(np.diff(joints, axis=0)) / TIMESTEP / SPEEDS)
+        return poses, joints[1:], float(haste)
 
     def _clear(self, start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:
         """Height of the tip's centre above cans, and obstacles close to a straight way."""
