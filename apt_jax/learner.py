@@ -10,6 +10,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from apt_jax.config import HParams
+from apt_jax.descent import ADAM, descend
 from apt_jax.losses import td_errors, td_target
 from apt_jax.networks import QNetwork
 from apt_jax.networks.apply import apply
@@ -32,13 +33,10 @@ class Kept(NamedTuple):
     score: Float[Array, ""]
 
 
-_ADAM = optax.flatten(optax.scale_by_adam())
-
-
 def init(network: QNetwork, key: Key[Array, ""]) -> LearnerState:
     """Fresh parameters, the target network equal to them; consumes `key`."""
     params = network.init(key, zeros_like(obs_struct(network.obs_spec)))
-    return LearnerState(params, jax.tree.map(jnp.copy, params), _ADAM.init(params))
+    return LearnerState(params, jax.tree.map(jnp.copy, params), ADAM.init(params))
 
 
 def greedy(network: QNetwork, params: Any, obs: Obs) -> Int[Array, "..."]:
@@ -94,8 +92,8 @@ def update(
         return jnp.mean(optax.losses.huber_loss(td_errors(q, batch.action, target))), q
 
     (value, q), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
-    direction, opt_state = _ADAM.update(grads, state.opt_state)
-    params = jax.tree.map(lambda p, d: p - hparams.learning_rate * d, state.params, direction)
+    direction, opt_state = ADAM.update(grads, state.opt_state)
+    params = descend(state.params, direction, hparams.learning_rate)
     target_params = optax.incremental_update(params, state.target_params, hparams.target_rate)
     return LearnerState(params, target_params, opt_state), {"td_loss": value, "q_mean": jnp.mean(jnp.max(q, axis=-1))}
 

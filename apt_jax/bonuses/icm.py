@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from apt_jax.bonuses.base import Bonus, Metrics, Step, Steps, Stream, leading, pay, sample
 from apt_jax.config import Config, HParams
+from apt_jax.descent import ADAM, descend
 from apt_jax.networks import Dynamics
 from apt_jax.networks.apply import apply
 from apt_jax.replay import Batch, Replay
@@ -19,8 +20,6 @@ from apt_jax.task_space import TaskSpace
 
 FORWARD_WEIGHT = 0.2
 """Share of the forward loss; the inverse loss has the rest (the paper's beta)."""
-
-_ADAM = optax.flatten(optax.scale_by_adam())
 
 
 class IcmState(NamedTuple):
@@ -39,7 +38,7 @@ def make(space: TaskSpace, config: Config) -> Bonus:
         del hparams
         obs = zeros_like(obs_struct(space.obs_spec))
         params = network.init(key, obs, jnp.int32(0), obs, detach=True)
-        return IcmState(params, _ADAM.init(params), Stream.start(leading(states)))
+        return IcmState(params, ADAM.init(params), Stream.start(leading(states)))
 
     def bonus(state: IcmState, steps: Steps, hparams: HParams) -> Float[Array, "..."]:
         _, predicted, embedding = apply(network, state.params, steps.obs, steps.action, steps.next_obs, detach=True)
@@ -66,8 +65,8 @@ def make(space: TaskSpace, config: Config) -> Bonus:
             }
 
         grads, metrics = jax.grad(loss, has_aux=True)(state.params)
-        direction, opt_state = _ADAM.update(grads, state.opt_state)
-        params = jax.tree.map(lambda p, d: p - hparams.bonus_learning_rate * d, state.params, direction)
+        direction, opt_state = ADAM.update(grads, state.opt_state)
+        params = descend(state.params, direction, hparams.bonus_learning_rate)
         return IcmState(params, opt_state, state.stream), metrics
 
     def return_range(state: IcmState, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:

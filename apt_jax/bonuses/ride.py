@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from apt_jax.bonuses.base import Bonus, Metrics, Step, Steps, Stream, leading, pay, sample
 from apt_jax.bonuses.icm import losses
 from apt_jax.config import Config, HParams
+from apt_jax.descent import ADAM, descend
 from apt_jax.networks import Dynamics
 from apt_jax.networks.apply import apply
 from apt_jax.replay import Batch, Replay
@@ -23,8 +23,6 @@ from apt_jax.task_space import TaskSpace
 FORWARD_WEIGHT = 10.0
 INVERSE_WEIGHT = 0.1
 """Of the two losses that the embedding learns from."""
-
-_ADAM = optax.flatten(optax.scale_by_adam())
 
 
 class Visits(NamedTuple):
@@ -61,7 +59,7 @@ def make(space: TaskSpace, config: Config) -> Bonus:
         obs = zeros_like(obs_struct(space.obs_spec))
         params = network.init(key, obs, jnp.int32(0), obs, detach=False)
         visits = over_environments(partial(start_episode, horizon=space.horizon))(fingerprint(states))
-        return RideState(params, _ADAM.init(params), visits, Stream.start(leading(states)))
+        return RideState(params, ADAM.init(params), visits, Stream.start(leading(states)))
 
     def bonus(state: RideState, steps: Steps, hparams: HParams) -> Float[Array, "..."]:
         phi, next_phi = (apply(network, state.params, obs, method="embed") for obs in (steps.obs, steps.next_obs))
@@ -90,8 +88,8 @@ def make(space: TaskSpace, config: Config) -> Bonus:
             }
 
         grads, metrics = jax.grad(loss, has_aux=True)(state.params)
-        direction, opt_state = _ADAM.update(grads, state.opt_state)
-        params = jax.tree.map(lambda p, d: p - hparams.bonus_learning_rate * d, state.params, direction)
+        direction, opt_state = ADAM.update(grads, state.opt_state)
+        params = descend(state.params, direction, hparams.bonus_learning_rate)
         return state._replace(params=params, opt_state=opt_state), metrics
 
     def return_range(state: RideState, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Float, Int, Key
 
 from apt_jax.bonuses.base import Bonus, Metrics, Step, Steps, Stream, leading, pay, sample
 from apt_jax.bonuses.moments import Moments
 from apt_jax.config import Config, HParams
+from apt_jax.descent import ADAM, descend
 from apt_jax.networks import Distillation
 from apt_jax.networks.apply import apply
 from apt_jax.networks.encoders import Features, observation_features
@@ -27,8 +27,6 @@ CLIP = 5.0
 
 EPSILON = 1e-8
 """Added to variances: some inputs never change."""
-
-_ADAM = optax.flatten(optax.scale_by_adam())
 
 
 class RndState(NamedTuple):
@@ -62,7 +60,7 @@ def make(space: TaskSpace, config: Config) -> Bonus:
         return RndState(
             target=target_network.init(key_target, features),
             predictor=predictor,
-            opt_state=_ADAM.init(predictor),
+            opt_state=ADAM.init(predictor),
             features={name: Moments.start(block.shape) for name, block in features.items()},
             filtered=jnp.zeros(leading(states)),
             scale=Moments.start(),
@@ -95,8 +93,8 @@ def make(space: TaskSpace, config: Config) -> Bonus:
     ) -> tuple[RndState, Metrics]:
         _, _, next_obs = sample(space, config, replay, key, iteration)
         loss, grads = jax.value_and_grad(lambda params: jnp.mean(error(state, params, next_obs)))(state.predictor)
-        direction, opt_state = _ADAM.update(grads, state.opt_state)
-        predictor = jax.tree.map(lambda p, d: p - hparams.bonus_learning_rate * d, state.predictor, direction)
+        direction, opt_state = ADAM.update(grads, state.opt_state)
+        predictor = descend(state.predictor, direction, hparams.bonus_learning_rate)
         return state._replace(predictor=predictor, opt_state=opt_state), {"rnd_loss": loss}
 
     def return_range(state: RndState, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:

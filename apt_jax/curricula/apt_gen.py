@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import replay as rp
 from apt_jax.config import Config, HParams
 from apt_jax.curricula.apt_gen_objectives import make_objectives, task_progress
 from apt_jax.curricula.base import GENERATED, TARGET, Curriculum, Metrics
+from apt_jax.descent import ADAM, descend
 from apt_jax.losses import adapt_beta
 from apt_jax.networks import init_singular_vectors, spectral_normalize
 from apt_jax.networks.apply import apply
@@ -37,9 +37,6 @@ class AptGenState(NamedTuple):
     batch_stats: Any
     spectral: Any
     beta: Float[Array, ""]
-
-
-_ADAM = optax.flatten(optax.scale_by_adam())
 
 
 def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, return_weight: float = 1.0) -> Curriculum:
@@ -81,7 +78,7 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
         batch_stats, _ = jax.lax.scan(settle, variables["batch_stats"], z)
         return AptGenState(
             models=models,
-            opt_state=_ADAM.init(models),
+            opt_state=ADAM.init(models),
             batch_stats=batch_stats,
             spectral=init_singular_vectors(key_spectral, models.discriminator),
             beta=jnp.asarray(hparams.beta_init, jnp.float32),
@@ -139,14 +136,14 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
             return loss_d + loss_1 + loss_2 + loss_g, (batch_stats, spectral, metrics)
 
         grads, (batch_stats, spectral, metrics) = jax.grad(loss, has_aux=True)(state.models)
-        direction, opt_state = _ADAM.update(grads, state.opt_state)
+        direction, opt_state = ADAM.update(grads, state.opt_state)
         rates = Models(
             generator=hparams.generator_learning_rate,
             discriminator=hparams.discriminator_learning_rate,
             progress_value=hparams.value_learning_rate,
             return_value=hparams.value_learning_rate,
         )
-        models = Models(*map(_descend, state.models, direction, rates))
+        models = Models(*map(descend, state.models, direction, rates))
         shrink = 1.0 - hparams.value_learning_rate * hparams.value_weight_decay
         models = models._replace(
             progress_value=jax.tree.map(lambda p: p * shrink, models.progress_value),
@@ -184,10 +181,6 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
         }
 
     return Curriculum(True, init, propose, update, refresh, report)
-
-
-def _descend(params: Any, direction: Any, rate: Float[Array, ""] | float) -> Any:
-    return jax.tree.map(lambda p, d: p - rate * d, params, direction)
 
 
 def explore(spec: Spec, w: Params, key: Key[Array, ""], hparams: HParams) -> Params:

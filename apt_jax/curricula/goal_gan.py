@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from apt_jax import replay as rp
 from apt_jax.config import Config, HParams
 from apt_jax.curricula.base import GENERATED, Curriculum, Metrics
+from apt_jax.descent import descend
 from apt_jax.losses import lsgan_discriminator_loss, lsgan_generator_loss
 from apt_jax.networks.apply import apply
 from apt_jax.specs import Params, block_weights, flatten, unflatten
@@ -136,7 +137,7 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
 
         grads, metrics = jax.grad(loss, has_aux=True)(state.networks)
         direction, opt_state = _RMSPROP.update(grads, state.opt_state)
-        networks = jax.tree.map(lambda p, d: p - hparams.goal_learning_rate * d, state.networks, direction)
+        networks = descend(state.networks, direction, hparams.goal_learning_rate)
         # Without a single good task there is nothing to learn but that all is bad.
         learns = any_good(state.labelled)
         networks, opt_state = jax.tree.map(

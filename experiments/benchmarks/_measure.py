@@ -37,6 +37,22 @@ _LOAD_AVERAGE = os.getloadavg()
 """Before the benchmark starts: above zero, something else was running and the timings are not to be trusted."""
 
 
+QUICK: dict[str, Any] = {
+    "warmup_steps": 500,
+    "updates_per_step": 1,
+    "batch_size": 8,
+    "replay_steps": 1_000,
+    "replay_episodes": 100,
+    "model_batch_size": 8,
+    "recent_steps": 500,
+    "refresh_every": 10,
+    "eval_every": 20,
+    "eval_episodes": 2,
+    "probe_tasks": 2,
+}
+"""Sizes that show within seconds that a script works; its figures mean nothing."""
+
+
 @dataclass(frozen=True)
 class Options:
     """What every benchmark can be told.

@@ -22,18 +22,8 @@ from experiments.errors import UsageError, exit_with
 BASE = "dqn"
 
 QUICK: dict[str, Any] = {
-    "warmup_steps": 500,
-    "updates_per_step": 1,
-    "batch_size": 8,
-    "replay_steps": 1_000,
-    "replay_episodes": 100,
+    **_measure.QUICK,
     "model_updates_per_step": 0.1,
-    "model_batch_size": 8,
-    "recent_steps": 500,
-    "refresh_every": 10,
-    "eval_every": 20,
-    "eval_episodes": 2,
-    "probe_tasks": 2,
     "alp_window": 20,
     "alp_history": 20,
     "alp_fit_every": 20,

@@ -24,20 +24,6 @@ MERGE_MATMUL = (128, 192, 128)
 LARGE_MATMUL = (1024, 1024, 1024)
 """Rows, inner size and columns: the Q-network's largest layer on a batch, and a matmul that is as fast as they come."""
 
-QUICK: dict[str, Any] = {
-    "warmup_steps": 500,
-    "updates_per_step": 1,
-    "batch_size": 8,
-    "replay_steps": 1_000,
-    "replay_episodes": 100,
-    "model_batch_size": 8,
-    "recent_steps": 500,
-    "refresh_every": 10,
-    "eval_every": 20,
-    "eval_episodes": 2,
-    "probe_tasks": 2,
-}
-
 
 @dataclass(frozen=True)
 class Args(Options):
@@ -128,7 +114,7 @@ def main() -> int:
     if args.quick:
         args = dataclasses.replace(args, repeats=1, at_least=0.0)
     matmuls = [time_matmul(*shape, args) for shape in (MERGE_MATMUL, LARGE_MATMUL)]
-    problems = {preset: _measure.load_problem(preset, **(QUICK if args.quick else {})) for preset in args.presets}
+    problems = {preset: _measure.load_problem(preset, **(_measure.QUICK if args.quick else {})) for preset in args.presets}
     results = {preset: measure(problem, args, rate=matmuls[0].rate) for preset, problem in problems.items()}
     text = "\n".join([matmul_table(matmuls), *(tables(preset, result) for preset, result in results.items())])
     _measure.report("training_step", args, {"matmuls": matmuls, "presets": results}, text)
