@@ -106,7 +106,7 @@ def test_numbers_in_tables(value, text):
 
 def test_each_preset_fits_the_quick_sizes():
     for preset in training_step.Args().presets:
-        _measure.load_problem(preset, **training_step.QUICK)
+        _measure.load_problem(preset, **_measure.QUICK)
 
 
 def test_a_script_writes_its_numbers_and_what_they_need_to_be_read(tmp_path):

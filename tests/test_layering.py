@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset({"registry", "specs"}),
+    frozenset({"descent", "registry", "specs"}),
     frozenset({"config", "task_space"}),
     frozenset({"losses", "networks", "replay"}),
     frozenset({"bonuses", "curricula", "learner"}),
