@@ -33,6 +33,8 @@ class HParams:
       value_weight_decay: decoupled weight decay of the value networks, per unit of their learning rate, >= 0.
       cell_noise: probability that a cell of a generated grid is played with a uniformly drawn category, in [0, 1] (paper: 0).
       vector_noise: standard deviation of the noise on generated vectors, as a share of their range, >= 0 (paper: 0).
+      vector_prior: weight of the divergence of generated vectors from a fresh generator's, which keeps numbers off the ends of
+        their range and different from task to task, >= 0 (paper: 0).
       spectral_bound: upper bound of the spectral norm of every layer of the discriminator, > 0 (paper: none).
       bonus_learning_rate: Adam step size of the networks behind an intrinsic reward, >= 0 (paper: 3e-4; RND's own 1e-4).
       icm_scale: factor on ICM's reward, >= 0 (its reference 0.01).
@@ -66,6 +68,7 @@ class HParams:
     value_weight_decay: float = 0.0
     cell_noise: float = 0.0
     vector_noise: float = 0.0
+    vector_prior: float = 0.0
     spectral_bound: float = math.inf
     bonus_learning_rate: float = 3e-4
     icm_scale: float = 0.01
@@ -87,7 +90,7 @@ def check_hparams(hparams: HParams) -> None:
       ValueError: the field, its value, and what is allowed.
     """
     positive = ("epsilon_steps", "beta_min", "spectral_bound", "alp_regularisation")
-    not_negative = ("tolerance", "pessimism", "value_weight_decay", "vector_noise", "goal_noise")
+    not_negative = ("tolerance", "pessimism", "value_weight_decay", "vector_noise", "vector_prior", "goal_noise")
     rates = tuple(field.name for field in dataclasses.fields(hparams) if field.name.endswith("learning_rate"))
     scales = ("icm_scale", "rnd_scale", "ride_scale")
     shares = (
@@ -210,6 +213,7 @@ PRESETS: dict[str, tuple[Config, HParams]] = {
             value_weight_decay=10.0,
             cell_noise=0.03,
             vector_noise=0.05,
+            vector_prior=0.03,
             spectral_bound=0.8,
         ),
     ),

@@ -15,6 +15,7 @@ from apt_jax import replay as rp
 from apt_jax.config import HParams
 from apt_jax.curricula import apt_gen
 from apt_jax.curricula import apt_gen_objectives as objectives
+from apt_jax.networks.generator import OUTPUT_NORM
 from apt_jax.specs import Grid, Table
 from tests.corridor import Corridor
 from tests.test_trainer import CONFIG, run
@@ -70,6 +71,37 @@ def test_generator_reaches_the_optimum_of_v1_plus_beta_v2(monkeypatch, experienc
 
     goal = curriculum.propose(train(state), jax.random.key(2), 256, hparams)["goal"]
     np.testing.assert_allclose(jnp.mean(goal), optimum, atol=0.3)
+
+
+class Indifferent(nn.Module):
+    """A value network to which all tasks are equal."""
+
+    param_spec: object
+
+    @nn.compact
+    def __call__(self, w):
+        return 0.0 * w["goal"][..., 0] + self.param("value", nn.initializers.zeros, ())
+
+
+@pytest.mark.parametrize(("prior", "mean", "deviation"), [(0.0, 8.98, 0.0), (0.03, 4.5, 1.9)])
+def test_prior_brings_a_number_back_from_the_end_of_its_range(monkeypatch, experience, prior, mean, deviation):
+    monkeypatch.setattr(objectives, "ValueNetwork", Indifferent)
+    replay, iteration = experience
+    hparams = HParams(value_learning_rate=0.0, generator_learning_rate=2e-2, vector_prior=prior)
+    curriculum = apt_gen.make(SPACE, CONFIG)
+    state = curriculum.init(jax.random.key(0), hparams)
+    norm = state.models.generator["goal"][OUTPUT_NORM]
+    norm["bias"], norm["scale"] = jnp.full(1, 6.0), jnp.full(1, 0.05)
+
+    @jax.jit
+    def train(state):
+        def update(state, key):
+            return curriculum.update(state, key, replay, iteration, hparams)[0], None
+
+        return jax.lax.scan(update, state, jax.random.split(jax.random.key(1), 1000))[0]
+
+    goal = curriculum.propose(train(state), jax.random.key(2), 512, hparams)["goal"]
+    np.testing.assert_allclose((jnp.mean(goal), jnp.std(goal)), (mean, deviation), atol=0.2)
 
 
 def test_discriminator_and_values_learn_from_the_same_experience(experience):

@@ -16,8 +16,10 @@ from apt_jax.networks import (
     init_singular_vectors,
     pool,
     spectral_normalize,
+    vector_divergence,
 )
 from apt_jax.networks.encoders import observation_features, parameter_features
+from apt_jax.networks.generator import OUTPUT_NORM
 from apt_jax.specs import Grid, Spec, Table, Vector
 
 NUM_ACTIONS = 4
@@ -253,6 +255,23 @@ def test_generator_running_statistics_converge():
         w, moved = generate_train(variables, z)
         variables = variables | moved
     chex.assert_trees_all_close(generate(variables, z), w, atol=1e-3)
+
+
+def test_vector_divergence_is_that_of_normal_distributions():
+    """Against an integral on a fine grid; grids take no part."""
+    biases, scales = np.array([2.0, -0.5]), np.array([0.3, -1.5])
+    x = np.linspace(-30.0, 30.0, 600_001)[:, None]
+
+    def log_density(x, mean, deviation):
+        return -0.5 * ((x - mean) / deviation) ** 2 - np.log(deviation * np.sqrt(2.0 * np.pi))
+
+    log_p, log_q = log_density(x, biases, np.abs(scales)), log_density(x, 0.0, 1.0)
+    expected = np.trapezoid(np.exp(log_p) * (log_p - log_q), x, axis=0).sum()
+    params = {"goal": {OUTPUT_NORM: {"bias": jnp.array(biases), "scale": jnp.array(scales)}}}
+    spec = {"table": Grid(6, 4, 3), "goal": Vector(2, 0.0, 9.0)}
+    np.testing.assert_allclose(vector_divergence(spec, params), expected, rtol=1e-5)
+    fresh = Generator(spec).init(jax.random.key(0), jnp.zeros((2, NOISE_SIZE)), train=True)["params"]
+    np.testing.assert_allclose(vector_divergence(spec, fresh), 0.0, atol=1e-6)
 
 
 def test_spectral_normalize_covers_every_kernel_of_the_discriminator():

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from apt_jax import losses
 from apt_jax import replay as rp
 from apt_jax.config import Config, HParams
-from apt_jax.networks import Discriminator, Generator, ValueNetwork, pool, spectral_normalize
+from apt_jax.networks import Discriminator, Generator, ValueNetwork, pool, spectral_normalize, vector_divergence
 from apt_jax.networks.apply import apply
 from apt_jax.specs import Params, Spec, Vector
 from apt_jax.task_space import TaskSpace
@@ -111,7 +111,8 @@ def make_objectives(
         objective = losses.generator_objective(
             progress_weight * progress, outcome, beta=return_weight * beta, delta=hparams.delta
         )
-        return -objective, (batch_stats, (jnp.mean(progress), jnp.mean(outcome)))
+        prior = hparams.vector_prior * vector_divergence(space.param_spec, params)
+        return prior - objective, (batch_stats, (jnp.mean(progress), jnp.mean(outcome)))
 
     return Objectives(networks, generate, score, evaluate, discriminator_loss, value_loss, generator_loss)
 

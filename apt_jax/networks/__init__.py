@@ -3,7 +3,7 @@
 from apt_jax.networks.discriminator import Discriminator, pool
 from apt_jax.networks.distillation import Distillation
 from apt_jax.networks.dynamics import Dynamics
-from apt_jax.networks.generator import Generator
+from apt_jax.networks.generator import Generator, vector_divergence
 from apt_jax.networks.q_network import QNetwork
 from apt_jax.networks.spectral import init_singular_vectors, spectral_normalize
 from apt_jax.networks.value_network import ValueNetwork
@@ -18,4 +18,5 @@ __all__ = [
     "init_singular_vectors",
     "pool",
     "spectral_normalize",
+    "vector_divergence",
 ]

@@ -14,6 +14,8 @@ from apt_jax.networks.encoders import CHANNELS, ENCODING_SIZE
 from apt_jax.networks.layers import Conv, ConvTranspose
 from apt_jax.specs import Grid, Params, Spec, Table, Vector
 
+OUTPUT_NORM = "output_norm"
+
 
 class Generator(nn.Module):
     """z [batch, noise_size] -> w, each modality [batch, ...].
@@ -58,8 +60,28 @@ class VectorHead(nn.Module):
 
     @nn.compact
     def __call__(self, hidden: Float[Array, "batch hidden"]) -> Float[Array, "batch size"]:
-        logits = self.norm()(nn.Dense(self.vector.size, use_bias=False)(hidden))
+        logits = self.norm(name=OUTPUT_NORM)(nn.Dense(self.vector.size, use_bias=False)(hidden))
         return self.vector.low + (self.vector.high - self.vector.low) * nn.sigmoid(logits)
+
+
+def vector_divergence(spec: Spec, params: Any) -> Float[Array, ""]:
+    """How far generated vectors have gone from a fresh generator's: KL(N(bias, scale^2) || N(0, 1)) summed over their numbers.
+
+    Those are the mean and the deviation over z that BatchNorm gives a number before its sigmoid, 0 and 1 at first.  A bias far
+    from 0 leaves a number at the end of its range, where the sigmoid is flat and nothing else would bring it back; a scale
+    near 0 makes it the same in all tasks.
+
+    Args:
+      spec: the task parameter's modalities.
+      params: the parameters of `Generator(spec)`.
+    """
+    norms = [params[name][OUTPUT_NORM] for name, modality in spec.items() if isinstance(modality, Vector)]
+    return sum((_divergence(norm["bias"], norm["scale"]) for norm in norms), jnp.float32(0.0))
+
+
+def _divergence(mean: Float[Array, "n"], deviation: Float[Array, "n"]) -> Float[Array, ""]:
+    variance = deviation**2 + 1e-8
+    return 0.5 * jnp.sum(mean**2 + variance - jnp.log(variance) - 1.0)
 
 
 def stream(

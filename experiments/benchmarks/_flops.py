@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from math import prod
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +14,18 @@ from jaxtyping import Array, Float
 
 from experiments.benchmarks._measure import Timing, time_loop
 
+Shape: TypeAlias = tuple[int, int, int]
+"""Rows, inner size and columns of a matmul."""
+
+
+def matmuls(function: Callable[..., Any], *args: Any) -> Counter[Shape]:
+    """How often one call of a function multiplies matrices of which shape."""
+    return _count(jax.make_jaxpr(function)(*args).jaxpr)
+
 
 def matmul_flops(function: Callable[..., Any], *args: Any) -> int:
     """Operations of every matmul in one call of a function, a multiply-add counted as two."""
-    return _count(jax.make_jaxpr(function)(*args).jaxpr)
+    return sum(2 * prod(shape) * count for shape, count in matmuls(function, *args).items())
 
 
 def compiled_flops(function: Callable[..., Any], *args: Any) -> float:
@@ -31,9 +40,10 @@ def time_matmuls(rows: int, inner: int, columns: int, *, repeats: int, at_least:
     Returns:
       The time of such a pair, and its operations.
     """
-    # Orthonormal columns: the product neither grows nor fades, however often it is repeated.
+    # Orthonormal columns or rows: the product does not grow, however often it is repeated.
     key_x, key_q = jax.random.split(jax.random.key(0))
-    there, _ = jnp.linalg.qr(jax.random.normal(key_q, (inner, columns)))
+    tall, _ = jnp.linalg.qr(jax.random.normal(key_q, (max(inner, columns), min(inner, columns))))
+    there = tall if inner >= columns else tall.T
     matrices = there, jnp.copy(there.T)
 
     def pair(x: Float[Array, "rows inner"], matrices: tuple[Array, Array]) -> Float[Array, "rows inner"]:
@@ -43,14 +53,17 @@ def time_matmuls(rows: int, inner: int, columns: int, *, repeats: int, at_least:
     return time_loop(pair, x, matrices, repeats=repeats, at_least=at_least), matmul_flops(pair, x, matrices)
 
 
-def _count(jaxpr: Jaxpr) -> int:
-    total = 0
+def _count(jaxpr: Jaxpr) -> Counter[Shape]:
+    total: Counter[Shape] = Counter()
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
-            (contracting, _), _ = equation.params["dimension_numbers"]
+            (contracting, _), (batch, _) = equation.params["dimension_numbers"]
             left: Any = equation.invars[0].aval
             out: Any = equation.outvars[0].aval
-            total += 2 * prod(out.shape) * prod(left.shape[axis] for axis in contracting)
-        inner = sum(_count(sub) for sub in jaxprs_in_params(equation.params))
-        total += inner * (equation.params["length"] if equation.primitive.name == "scan" else 1)
+            copies, inner = (prod(left.shape[axis] for axis in axes) for axes in (batch, contracting))
+            rows = prod(left.shape) // (copies * inner)
+            total[rows, inner, prod(out.shape) // (copies * rows)] += copies
+        runs = equation.params["length"] if equation.primitive.name == "scan" else 1
+        for sub in jaxprs_in_params(equation.params):
+            total.update({shape: runs * count for shape, count in _count(sub).items()})
     return total

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import learner, replay, workers
 from apt_jax.curricula import apt_gen
 from apt_jax.curricula.apt_gen_objectives import make_objectives
 from apt_jax.curricula.base import GENERATED, TARGET
+from apt_jax.descent import ADAM, descend
 from apt_jax.methods import make_method
 from apt_jax.networks import QNetwork
 from apt_jax.specs import zeros_like
@@ -21,7 +21,6 @@ from apt_jax.trainer import Clock, TrainState
 from experiments.benchmarks._measure import Problem, Timing, time_loop
 
 SOURCES = 2
-_ADAM = optax.flatten(optax.scale_by_adam())
 
 
 class Part(NamedTuple):
@@ -151,16 +150,16 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
         key_target, key_generated = jax.random.split(key)
         return (), (rollouts(key_target, TARGET), rollouts(key_generated, GENERATED))
 
-    def descend(loss: Callable[[Any], tuple[Float[Array, ""], Any]], params: Any, opt_state: Any) -> Any:
+    def optimise(loss: Callable[[Any], tuple[Float[Array, ""], Any]], params: Any, opt_state: Any) -> Any:
         grads, aux = jax.grad(loss, has_aux=True)(params)
-        direction, opt_state = _ADAM.update(grads, opt_state)
-        return jax.tree.map(lambda p, d: p - hparams.learning_rate * d, params, direction), opt_state, aux
+        direction, opt_state = ADAM.update(grads, opt_state)
+        return descend(params, direction, hparams.learning_rate), opt_state, aux
 
     def update_discriminator(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         del key
         params, opt_state, spectral = state
         target, generated = _alternate(fixed, iteration)
-        params, opt_state, (_, spectral) = descend(
+        params, opt_state, (_, spectral) = optimise(
             lambda params: objectives.discriminator_loss(params, spectral, target, generated, hparams), params, opt_state
         )
         return (params, opt_state, spectral), ()
@@ -174,14 +173,14 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
             losses = [objectives.value_loss(ensemble, generated.w, generated.episode_return)[0] for ensemble in ensembles]
             return sum(losses, jnp.float32(0.0)), ()
 
-        params, opt_state, _ = descend(loss, *state)
+        params, opt_state, _ = optimise(loss, *state)
         return (params, opt_state), ()
 
     def update_generator(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         del iteration
         params, opt_state, batch_stats = state
         z = jax.random.normal(key, (config.model_batch_size, config.noise_size))
-        params, opt_state, (batch_stats, _) = descend(
+        params, opt_state, (batch_stats, _) = optimise(
             lambda params: objectives.generator_loss(params, batch_stats, z, fixed, jnp.float32(1.0), hparams),
             params,
             opt_state,
@@ -191,12 +190,12 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
     record = jax.jit(jax.vmap(sample, in_axes=(None, None, 0, None)))
     _, rollouts = record((), state.replay, jax.random.split(jax.random.key(2)), clock.iteration - 1)
     ensembles = models.progress_value, models.return_value
-    discriminator_state = models.discriminator, _ADAM.init(models.discriminator), fresh.spectral
-    generator_state = models.generator, _ADAM.init(models.generator), fresh.batch_stats
+    discriminator_state = models.discriminator, ADAM.init(models.discriminator), fresh.spectral
+    generator_state = models.generator, ADAM.init(models.generator), fresh.batch_stats
     return {
         "sample rollouts": Part(sample, (), state.replay),
         "discriminator": Part(update_discriminator, discriminator_state, rollouts),
-        "values": Part(update_values, (ensembles, _ADAM.init(ensembles)), rollouts),
+        "values": Part(update_values, (ensembles, ADAM.init(ensembles)), rollouts),
         "generator": Part(update_generator, generator_state, ensembles),
     }
 

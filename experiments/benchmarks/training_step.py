@@ -69,12 +69,15 @@ class PolicyUpdate:
       compiled_flops: all its operations as the compiler estimates them.
       matmul_share: of the matmul rate that its matmuls are done at; everything else it does lowers the share.
       matmul_share_with_sampling: the same with the time to sample its batch added.
+      own_shapes_share: the share that its matmuls would reach if nothing else took any time, each as fast as its own shape
+        alone: the rest up to 1 is owed to matrices smaller than the one that the rate is of.
     """
 
     matmul_flops: int
     compiled_flops: float
     matmul_share: float
     matmul_share_with_sampling: float
+    own_shapes_share: float
 
 
 @dataclass(frozen=True)
@@ -148,7 +151,9 @@ def measure(problem: Problem, args: Args, *, rate: float) -> Result:
     batches, _ = pieces["update policy"].fixed
     batch = jax.tree.map(lambda x: x[0], batches)
     update = partial(_parts.policy_update, problem)
+    shapes = _flops.matmuls(update, state, batch)
     matmul_flops = _flops.matmul_flops(update, state, batch)
+    own_shapes = sum(count * time_matmul(*shape, args).timing.median / 2 for shape, count in shapes.items())
     useful = config.updates_per_step * matmul_flops / rate  # seconds per environment step, were all else free
     return Result(
         config=config,
@@ -162,6 +167,7 @@ def measure(problem: Problem, args: Args, *, rate: float) -> Result:
             compiled_flops=_flops.compiled_flops(update, state, batch),
             matmul_share=useful / parts["update policy"].median,
             matmul_share_with_sampling=useful / (parts["update policy"].median + parts["sample"].median),
+            own_shapes_share=matmul_flops / rate / own_shapes,
         ),
     )
 
@@ -212,7 +218,8 @@ def tables(preset: str, result: Result) -> str:
             _measure.table([f"{preset}: piece of a model update", "ms", "of the pieces' sum"], model_rows),
             f"A policy update does {policy.matmul_flops / 1e6:.1f} MFLOP in matmuls ({policy.compiled_flops / 1e6:.1f} MFLOP "
             f"in all by the compiler's count), at {policy.matmul_share:.1%} of the rate of the first matmul above; "
-            f"{policy.matmul_share_with_sampling:.1%} with sampling.\n",
+            f"{policy.matmul_share_with_sampling:.1%} with sampling.  Its matmuls alone, each at the rate of its own shape, "
+            f"would reach {policy.own_shapes_share:.1%}.\n",
         ]
     )
 
