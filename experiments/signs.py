@@ -24,7 +24,8 @@ HEADER = (
     "distance of the goal",
     "V1's correlation",
     "V2's correlation",
-    "V2's bias",
+    "V2's bias, policy frozen",
+    "V2's bias, policy learning",
 )
 
 
@@ -33,6 +34,9 @@ class Signs:
     """Print the curriculum's own signs.
 
     What changes over training is shown at each quarter of it, as the mean of the five evaluations up to there.
+    V2's bias is taken twice: of its estimate of fresh tasks less their return under the policy frozen as it is at the
+    evaluation, and of what the generator believes it earns (V2 of its proposals, before exploration and less `pessimism`) less
+    what generated episodes do return, in which the policy goes on learning.
 
     Attributes:
       runs: directories of runs with a generator; a run is called by its directory's name.
@@ -86,6 +90,7 @@ def row(
         over_time(curves.get("probe_goal_distance"), 1),
         *(f"{np.nanmean(curves[name][late]):.2f}" for name in ("v1_correlation", "v2_correlation")),
         f"{np.nanmean(curves['v2_bias'][late]):+.2f}",
+        f"{np.nanmean((curves['generator_return'] - curves['generated_episode_return'])[late]):+.2f}",
     )
     return f"| {' | '.join(cells)} |"
 

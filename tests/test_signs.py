@@ -24,6 +24,7 @@ def test_a_row_averages_what_lies_after_the_given_step():
         "v1_correlation": np.where(late, 0.25, 9.0),
         "v2_correlation": np.where(late, -0.5, 9.0),
         "v2_bias": np.where(late, 0.1, 9.0),
+        "generator_return": np.where(late, 0.25, 9.0),
     }
     row = signs.row("run", 3, env_steps, curves, 4_000, {"beta_min": 0.125, "beta_max": 8.0})
-    assert row == "| run | 3 | 0.50 (0.50 to 0.50) | 50%, 25% | - | - | - | - | 0.25 | -0.50 | +0.10 |"
+    assert row == "| run | 3 | 0.50 (0.50 to 0.50) | 50%, 25% | - | - | - | - | 0.25 | -0.50 | +0.10 | -0.25 |"
