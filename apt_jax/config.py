@@ -209,7 +209,6 @@ PRESETS: dict[str, tuple[Config, HParams]] = {
         HParams(
             learning_rate=1e-3,
             generator_learning_rate=7e-4,
-            gamma=0.97,
             value_weight_decay=10.0,
             cell_noise=0.03,
             vector_noise=0.05,
