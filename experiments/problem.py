@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,8 +30,18 @@ def load_target(space: str, name: str, file: Path | None) -> Any:
         raise UsageError(str(error)) from error
 
 
+def import_plugins(names: Iterable[str]) -> None:
+    """Imports modules that register what they add; raises a `UsageError` for one that is not there."""
+    for name in names:
+        try:
+            import_module(name)
+        except ModuleNotFoundError as error:
+            raise UsageError(f"--plugins {name}: {error}") from error
+
+
 def make_problem(experiment: Experiment) -> Problem:
-    """Checks every name and size before anything is compiled; raises a `UsageError`."""
+    """Imports plug-ins and checks every name and size before anything is compiled; raises a `UsageError`."""
+    import_plugins(experiment.plugins)
     target = load_target(experiment.space, experiment.target, experiment.target_file)
     space = envs.make(experiment.space)
     try:

@@ -31,6 +31,7 @@ class Experiment:
       target_file: a file that describes the target task, whatever `target` says.
       seeds: one lane of the compiled program each, for every combination of swept hyper-parameters.
       env_steps: environment steps of all sources together, warm-up included.
+      plugins: Python modules to import first, which may add methods of their own to those that come with apt_jax.
       config: sizes and names; a change compiles a new program.
       hparams: numbers; a field may hold a tuple of values, all of which are run.
     """
@@ -40,6 +41,7 @@ class Experiment:
     target_file: Path | None = None
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     env_steps: int = 100_000
+    plugins: tuple[str, ...] = ()
     config: Config = dataclasses.field(default_factory=Config)
     hparams: tyro.conf.Suppress[HParams] = dataclasses.field(default_factory=HParams)
 
@@ -181,6 +183,7 @@ def load(directory: Path) -> Experiment:
                 **saved,
                 "target_file": directory / saved["target_file"] if saved["target_file"] else None,
                 "seeds": tuple(saved["seeds"]),
+                "plugins": tuple(saved.get("plugins", ())),
                 "config": Config(**saved["config"]),
                 "hparams": HParams(**{name: _numbers(value) for name, value in saved["hparams"].items()}),
             }

@@ -54,6 +54,7 @@ def start_run(path: Path, *options: str) -> Experiment:
         ("--env-steps 10000", r"warmup_steps \(10000\) .* is 11000"),
         ("--env-steps 20400", r"eval_every \(1000\); closest to 20400 is 20000"),
         ("--space gird_world", "closest is 'grid_world'"),
+        ("--plugins experiments.laddr", "--plugins experiments.laddr: No module named 'experiments.laddr'"),
         ("--target a", "closest is 'A'"),
         ("--method apt-gen", "closest is 'apt_gen'"),
         ("--config.batch-size 5", "batch_size must be a positive multiple"),

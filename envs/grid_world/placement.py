@@ -13,6 +13,7 @@ The paper's rule is read as follows (appendix "Grid-World"):
 from __future__ import annotations
 
 import chex
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float32, Int32
 
@@ -33,6 +34,15 @@ def place(w: Params) -> Task:
     interior = jnp.argmax(w["tiles"], axis=-1).astype(jnp.uint8)
     objects = chosen_tiles(w["xy"])
     return make_task(interior, objects, appears(objects))
+
+
+def parameter(task: Task) -> Params:
+    """A parameter that `place` makes this task of: one-hot scores, and every object in the middle of its tile.
+
+    Objects that are absent lie on the border.
+    """
+    tiles = jax.nn.one_hot(task.tiles[1:-1, 1:-1], CATEGORIES)
+    return {"tiles": tiles, "xy": task.objects.reshape(-1).astype(jnp.float32) + 0.5}
 
 
 def chosen_tiles(xy: Float32[Array, "10"]) -> Int32[Array, "5 2"]:
