@@ -2,8 +2,8 @@
 
 Uniformly random actions, no agent, no replay; where an episode ends, a fresh random task begins.  The others are the extra
 `peers` (`pip install -c constraints.txt -e '.[peers]'`); one that is missing is left out.  Common to all: a 10 x 10 board,
-keys and doors, a 7 x 7 view that sees through walls, episodes of at most 50 steps, one process on the same cores.  A step is the
-move, its reward, whether the episode ended, the observation, and the reset where it did end.  What differs:
+keys and doors, a 7 x 7 view that sees through walls, episodes of at most 50 steps, one process on the same cores.  A step is
+the move, its reward, whether the episode ended, the observation, and the reset where it did.  What differs:
 
 * Grid-World draws 64 tiles and 5 objects for a task (the paper's parameter w, then M(w)); it observes the view and the places
   of the agent and of the objects.  4 actions.  A third of the tiles is lava, so that episodes are short.
