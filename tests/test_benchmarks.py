@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from apt_jax.config import Config, HParams
-from experiments.benchmarks import _flops, _measure, training_step
+from experiments.benchmarks import _flops, _measure, environments, training_step
+from experiments.benchmarks._grid_worlds import JaxWorld, restart
 from tests.corridor import Corridor
 
 CONFIG = Config(
@@ -107,6 +108,34 @@ def test_numbers_in_tables(value, text):
 def test_each_preset_fits_the_quick_sizes():
     for preset in training_step.Args().presets:
         _measure.load_problem(preset, **_measure.QUICK)
+
+
+COUNTDOWN = JaxWorld(
+    start=lambda key: {"left": jnp.int32(3), "draw": jax.random.uniform(key, (2,))},
+    step=lambda state, action: {**state, "left": state["left"] - 1 - 0 * action},
+    done=lambda state: state["left"] == 0,
+    num_actions=2,
+)
+"""Episodes of three steps."""
+
+
+@pytest.mark.parametrize("group", [1, 3])
+def test_an_environment_restarts_where_its_episode_ended_and_only_there(group):
+    left = jnp.array([0, 2, 0, 0, 1, 0, 2, 0], jnp.int32)
+    states = {"left": left, "draw": jnp.full((8, 2), -1.0)}
+    after, done = jax.jit(lambda states, key: restart(COUNTDOWN, states, key, group))(states, jax.random.key(0))
+    np.testing.assert_array_equal(done, left == 0)
+    np.testing.assert_array_equal(after["left"], np.where(left == 0, 3, left))
+    np.testing.assert_array_equal(after["draw"][~done], -1.0)
+    assert len(np.unique(after["draw"][done])) == 2 * 5  # each its own draw
+
+
+def test_a_random_walk_counts_its_episodes():
+    walk = environments.walk(COUNTDOWN, environments.Args(repeats=2, batches=(16,), at_least=0.0))
+    assert walk.episode_length == pytest.approx(3, rel=0.01)
+    assert list(walk.step) == [16]
+    text = environments.tables({"ours": walk, "theirs": walk}, (16,))
+    assert "| theirs | 1 |" in text
 
 
 def test_a_script_writes_its_numbers_and_what_they_need_to_be_read(tmp_path):

@@ -1,11 +1,14 @@
 """How long a run takes to get going: `python -m experiments.benchmarks.compile_time`.
 
 Each start is a new process, with a compilation cache that is empty ("cold") or that the start before has filled ("warm").
+What happens before anything is compiled, importing and answering `--help`, is timed apart.
 """
 
 from __future__ import annotations
 
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -20,7 +23,7 @@ from apt_jax.lanes import make_program, stack_hparams
 from apt_jax.trainer import Clock, make_trainer
 from experiments import runtime
 from experiments.benchmarks import _measure
-from experiments.benchmarks._measure import Options
+from experiments.benchmarks._measure import Options, Timing
 from experiments.errors import exit_with
 
 
@@ -61,6 +64,14 @@ class Start:
     peak_memory: int
 
 
+IMPORTS = {
+    "import apt_jax": ("-c", "import apt_jax"),
+    "import apt_jax.lanes": ("-c", "import apt_jax.lanes"),
+    "experiments.train --help": ("-m", "experiments.train", "--help"),
+}
+"""Arguments of a Python that compiles nothing; `apt_jax.lanes` imports the whole trainer."""
+
+
 def main() -> int:
     """The command line."""
     args = tyro.cli(Args, prog="python -m experiments.benchmarks.compile_time")
@@ -70,6 +81,7 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as cache:
             for kind in starts:
                 starts[kind].append(_measure.in_new_process(start, Path(cache), args, requested=time.time()))
+    imports = {name: time_process(*arguments, repeats=args.repeats) for name, arguments in IMPORTS.items()}
     columns: dict[str, Callable[[Start], float]] = {
         "process and imports, s": lambda s: s.imports,
         "init, s": lambda s: s.init,
@@ -79,8 +91,26 @@ def main() -> int:
         "peak memory, MiB": lambda s: s.peak_memory / 2**20,
     }
     rows = [[kind, *(_cell([column(s) for s in group]) for column in columns.values())] for kind, group in starts.items()]
-    _measure.report("compile_time", args, dict(starts), _measure.table(["cache", *columns], rows))
+    text = "\n".join(
+        (
+            _measure.table(["process", "s"], [[name, timing.cell(1.0)] for name, timing in imports.items()]),
+            _measure.table(["cache", *columns], rows),
+        )
+    )
+    _measure.report("compile_time", args, {**starts, "imports": imports}, text)
     return 0
+
+
+def time_process(*arguments: str, repeats: int) -> Timing:
+    """A Python process from start to end; the first, which writes byte code and fills the disk's cache, is left out."""
+
+    def run() -> float:
+        began = time.perf_counter()
+        subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL)
+        return time.perf_counter() - began
+
+    run()
+    return Timing(tuple(run() for _ in range(repeats)), 0.0)
 
 
 def start(cache: Path, args: Args, *, requested: float) -> Start:
