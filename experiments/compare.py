@@ -13,11 +13,11 @@ from pathlib import Path
 import tyro
 
 from apt_jax.methods import METHODS
-from experiments import plots, report, runtime, settings
+from experiments import plots, report, settings
 from experiments.errors import UsageError, exit_with
 from experiments.problem import make_problem
 from experiments.settings import Experiment, Session
-from experiments.train import train
+from experiments.train import start_jax, train
 
 OWN = ("run-dir", "resume", "method", "target", "target-file", "config.method")
 """Options of `experiments.train` that are decided here."""
@@ -42,7 +42,7 @@ def main() -> int:
     """The command line."""
     comparison, options = tyro.cli(Compare, prog="python -m experiments.compare", return_unknown_args=True)
     runs = plan(comparison, options)
-    runtime.setup(runs[0][1].devices)
+    start_jax(runs[0][1])
     for experiment, _ in runs:  # what is wrong with the last is told before the first begins
         make_problem(experiment)
     for experiment, session in runs:
