@@ -115,7 +115,7 @@ def _spread(devices: Sequence[jax.Device], lanes: int) -> list[jax.Device]:
     if lanes < len(by_process):
         raise ValueError(f"{len(by_process)} processes need at least a lane each (a seed, or a value of a sweep), got {lanes}")
     turns = chain.from_iterable(zip_longest(*by_process.values()))
-    chosen = set(islice((device for device in turns if device), lanes))
+    chosen = set(islice((device for device in turns if device is not None), lanes))
     return [device for device in devices if device in chosen]
 
 

@@ -114,6 +114,7 @@ def test_two_processes_train_as_one_and_one_goes_on_for_both(tmp_path, start, wh
 def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(tmp_path, monkeypatch, cache, whole, capfd):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(cache))
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # by default workers yield to everything else on a busy machine
     monkeypatch.setattr(compare, "make_alone", corridor_runs.make_and_be_killed_once)
     comparison = Compare(tmp_path, methods=("random",), targets=("far",), ray=True)
     runs = compare.plan(comparison, OPTIONS)
