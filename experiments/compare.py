@@ -120,8 +120,6 @@ def plan(comparison: Compare, options: Sequence[str]) -> list[tuple[Experiment, 
         raise UsageError("--methods and --targets need different names")
     if comparison.seeds_per_job is not None and comparison.seeds_per_job < 1:
         raise UsageError(f"--seeds-per-job must be at least 1, got {comparison.seeds_per_job}")
-    if comparison.ray:
-        jobs.check_installed()
     runs = []
     for target in comparison.targets:
         for method in comparison.methods:
@@ -136,8 +134,10 @@ def plan(comparison: Compare, options: Sequence[str]) -> list[tuple[Experiment, 
             for i in range(0, len(seeds), comparison.seeds_per_job):
                 own = [str(seed) for seed in seeds[i : i + comparison.seeds_per_job]]
                 runs.append(_run(path / f"seeds_{'_'.join(own)}", [*words, "--seeds", *own]))
-    if comparison.ray and runs[0][1].distributed:
-        raise UsageError("--ray and --distributed exclude each other: a job is one process")
+    if comparison.ray:
+        if runs[0][1].distributed:
+            raise UsageError("--ray and --distributed exclude each other: a job is one process")
+        jobs.check_installed()
     return runs
 
 
