@@ -44,8 +44,8 @@ def restore(directory: Path, template: Tree) -> Tree:
 def rows(directory: Path) -> int:
     """The leading axis that all arrays of the latest checkpoint share, scalars aside."""
     step = _require_step(directory)
-    with _readable(directory, step), ocp.StandardCheckpointer() as checkpointer:
-        saved = checkpointer.metadata(directory.resolve() / str(step) / "default").item_metadata
+    with _readable(directory, step):
+        saved = ocp.StandardCheckpointHandler().metadata(directory.resolve() / str(step) / "default")
         (length,) = {leaf.shape[0] for leaf in jax.tree.leaves(saved.tree) if leaf.shape}
         return length
 
