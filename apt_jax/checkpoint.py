@@ -1,11 +1,14 @@
 """Saving a pytree of arrays and restoring it, bit for bit: a thin layer on orbax.
 
-Typed PRNG keys and sharded arrays are stored as they are.  A step is written beside the previous one and takes its place only
-when complete, so an interrupted save loses nothing.
+Typed PRNG keys and sharded arrays are stored as they are.  Processes that share an array each write and read a part of it, so
+they save and restore together.  A step is written beside the previous one and takes its place only when complete, so an
+interrupted save loses nothing.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,23 +35,41 @@ def restore(directory: Path, template: Tree) -> Tree:
       directory: where `save` wrote.
       template: arrays, or `ShapeDtypeStruct`s with a sharding: structure, shapes, dtypes and placement of the result.
     """
-    step = latest_step(directory)
-    if step is None:
-        raise CheckpointError(f"no checkpoint in {directory}")
+    step = _require_step(directory)
     abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), template)
-    try:
-        with _manager(directory) as manager:
-            return manager.restore(step, args=ocp.args.StandardRestore(abstract))
-    except Exception as error:  # orbax and its storage layer raise many unrelated types
-        raise CheckpointError(f"checkpoint {step} in {directory} cannot be restored: {error}") from error
+    with _readable(directory, step), _manager(directory) as manager:
+        return manager.restore(step, args=ocp.args.StandardRestore(abstract))
+
+
+def rows(directory: Path) -> int:
+    """The leading axis that all arrays of the latest checkpoint share, scalars aside."""
+    step = _require_step(directory)
+    with _readable(directory, step):
+        saved = ocp.StandardCheckpointHandler().metadata(directory.resolve() / str(step) / "default")
+        (length,) = {leaf.shape[0] for leaf in jax.tree.leaves(saved.tree) if leaf.shape}
+        return length
 
 
 def latest_step(directory: Path) -> int | None:
-    """The step of the latest complete checkpoint, None without one."""
-    if not directory.is_dir():
-        return None
-    with _manager(directory) as manager:
-        return manager.latest_step()
+    """The step of the latest complete checkpoint, None without one; any process may ask by itself."""
+    latest = ocp.path.step.latest_step_metadata(directory.resolve(), ocp.path.step.standard_name_format())
+    return latest and latest.step
+
+
+def _require_step(directory: Path) -> int:
+    step = latest_step(directory)
+    if step is None:
+        raise CheckpointError(f"no checkpoint in {directory}")
+    return step
+
+
+@contextmanager
+def _readable(directory: Path, step: int) -> Iterator[None]:
+    """Whatever goes wrong within it is a `CheckpointError`."""
+    try:
+        yield
+    except Exception as error:  # orbax and its storage layer raise many unrelated types
+        raise CheckpointError(f"checkpoint {step} in {directory} cannot be restored: {error}") from error
 
 
 def _manager(directory: Path) -> ocp.CheckpointManager:

@@ -1,14 +1,18 @@
 """Many seeds and hyper-parameters as lanes of one compiled program.
 
 A lane is one (key, HParams).  The functions of `apt_jax.trainer` know nothing of lanes; here they are batched, sharded over
-devices and jitted.  Within a device, lanes run side by side ("vmap", best on accelerators) or one after another ("map": on CPU
-its time per seed does not grow with their number, under "vmap" it does; BENCHMARKS.md, "Many seeds").
+devices, also those of other hosts, and jitted.  The program has no collectives, so no device ever waits for another (one CPU
+device that waits for another longer than a minute ends the process: XLA takes it for a deadlock).
+
+Within a device, lanes run side by side ("vmap", best on accelerators) or one after another ("map": on CPU its time per seed
+does not grow with their number, under "vmap" it does; BENCHMARKS.md, "Many seeds").
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import chain, islice, zip_longest
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -26,12 +30,12 @@ Layout = Literal["auto", "vmap", "map"]
 class Program(NamedTuple):
     """A trainer over L lanes, jitted; states are donated: after a call only the returned one is valid.
 
-    States hold at least L lanes (padded to a multiple of the devices by repeating the last); metrics hold exactly L.
+    States and metrics hold at least L lanes: the last is repeated up to a multiple of the devices.
 
     Attributes:
       init: `init(keys, hparams) -> states`, for keys [L] and hparams with leaves [L].
       warmup: `warmup(states, clock, hparams) -> (states, clock)`.
-      chunk: `chunk(states, clock, hparams) -> (states, clock, metrics)`, metrics with leaves [L].
+      chunk: `chunk(states, clock, hparams) -> (states, clock, metrics)`.
     """
 
     init: Callable[[Key[Array, "L"], HParams], TrainState]
@@ -57,14 +61,14 @@ def make_program(
     Args:
       layout: how the lanes of one device are laid out; "auto" is "map" on CPU and "vmap" elsewhere.
       at_once: lanes of one device that "vmap" puts side by side, the others in turn, if not all fit its memory; all by default.
-      devices: what to shard lanes over, by default every device; no more are used than there are lanes.
+      devices: what to shard lanes over, by default every device of every process; no more are used than there are lanes.
 
     Raises:
-      ValueError: fewer than one lane, or than one at once.
+      ValueError: fewer than one lane, or than one at once, or fewer lanes than processes.
     """
     if lanes < 1 or (at_once is not None and at_once < 1):
         raise ValueError(f"a program needs at least one lane and one at once, got {lanes} and {at_once}")
-    used = list(devices or jax.devices())[:lanes]
+    used = _spread(devices or jax.devices(), lanes)
     if layout == "auto":
         layout = "map" if used[0].platform == "cpu" else "vmap"
     mesh = Mesh(np.array(used), ("lane",))
@@ -98,10 +102,21 @@ def make_program(
 
     @partial(jax.jit, donate_argnums=0)
     def chunk_all(states: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock, Metrics]:
-        states, clock, metrics = chunk(states, clock, pad(hparams))
-        return states, clock, jax.tree.map(lambda x: x[:lanes], metrics)
+        return chunk(states, clock, pad(hparams))
 
     return Program(init_all, warmup_all, chunk_all)
+
+
+def _spread(devices: Sequence[jax.Device], lanes: int) -> list[jax.Device]:
+    """As many devices as there are lanes, if there are so many, taken from the processes by turns."""
+    by_process: dict[int, list[jax.Device]] = {}
+    for device in devices:
+        by_process.setdefault(device.process_index, []).append(device)
+    if lanes < len(by_process):
+        raise ValueError(f"{len(by_process)} processes need at least a lane each (a seed, or a value of a sweep), got {lanes}")
+    turns = chain.from_iterable(zip_longest(*by_process.values()))
+    chosen = set(islice((device for device in turns if device is not None), lanes))
+    return [device for device in devices if device in chosen]
 
 
 def _axes(specs: Any) -> Any:

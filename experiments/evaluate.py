@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import tyro
-from jax.sharding import SingleDeviceSharding
+from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
 
@@ -64,9 +64,9 @@ def evaluate(args: Args) -> None:
         experiment = dataclasses.replace(experiment, target=args.target or experiment.target, target_file=args.target_file)
     problem = make_problem(experiment)
     keys, hparams = lane_inputs(experiment)
-    here = SingleDeviceSharding(jax.devices()[0])
+    here = Mesh(np.array(jax.devices()[:1]), ("lane",))
     states, clock = load_states(RunDir(args.run_dir).checkpoints, problem.trainer, keys, hparams, here)
-    policies = states.learner.params
+    policies = jax.tree.map(lambda x: x[: len(experiment.lanes)], states.learner.params)
     key_score, key_film = jax.random.split(jax.random.key(args.seed))
     outcome = episodes.score(problem.trainer, policies, problem.target, episodes=args.episodes, key=key_score)
     names = [lane.name for lane in experiment.lanes]

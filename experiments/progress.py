@@ -15,6 +15,8 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
+from experiments import processes
+
 Metrics = Mapping[str, Float[np.ndarray, "S"]]
 
 COLUMNS = {"target_return": "target return", "generated_episode_return": "generated return", "beta": "beta"}
@@ -126,8 +128,32 @@ class PlainView:
         """Nothing to stop."""
 
 
+class Silence:
+    """Nothing, because another process tells it."""
+
+    def __enter__(self) -> Silence:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None) -> None:
+        pass
+
+    def note(self, text: str) -> None:
+        """Not here."""
+
+    def start(self, env_steps: int) -> None:
+        """Not here."""
+
+    def write(self, env_steps: int, metrics: Metrics) -> None:
+        """Not here."""
+
+    def stop(self) -> None:
+        """Nothing to stop."""
+
+
 def make_view(lanes: Sequence[str], total: int) -> View:
-    """Live on a terminal, plain elsewhere."""
+    """Live on a terminal, plain elsewhere; silent in all processes but the first."""
+    if not processes.is_first():
+        return Silence()
     console = Console()
     return LiveView(lanes, total, console) if console.is_terminal else PlainView(total)
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from experiments import plots, run_dir
 from experiments.aggregates import iqm, iqm_interval
-from experiments.errors import exit_with
+from experiments.errors import UsageError, exit_with
 
 SOLVED = 0.9
 """Target return from which a task counts as solved."""
@@ -53,11 +53,25 @@ def main() -> int:
 
 def read(paths: Sequence[Path]) -> dict[str, plots.Run]:
     """Metrics of every run and setting, by name; raises a `UsageError` for a directory without any."""
-    return {
-        f"{path.name}, {setting}" if setting else path.name: run
-        for path in paths
-        for setting, run in run_dir.read_settings(path).items()
-    }
+    return {name: run for path in paths for name, run in read_parts(path.name, [path]).items()}
+
+
+def read_parts(name: str, paths: Sequence[Path]) -> dict[str, plots.Run]:
+    """Like `read`, for one run whose seeds are spread over several directories.
+
+    Raises:
+      UsageError: no evaluation yet, or directories that do not make one run.
+    """
+    parts = [run_dir.read_settings(path) for path in paths]
+    runs = {}
+    for setting, (env_steps, first) in parts[0].items():
+        same = [part[setting] for part in parts if setting in part and np.array_equal(part[setting][0], env_steps)]
+        curves = {metric: np.concatenate([curves[metric] for _, curves in same]) for metric in first}
+        if len(same) != len(parts) or len(set(curves["seed"][:, 0])) != len(curves["seed"]):
+            listed = ", ".join(str(path) for path in paths)
+            raise UsageError(f"not the seeds of one run, each once and up to the same step: {listed}")
+        runs[f"{name}, {setting}" if setting else name] = env_steps, curves
+    return runs
 
 
 def table(runs: dict[str, plots.Run]) -> str:

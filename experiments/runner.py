@@ -1,23 +1,24 @@
-"""All lanes of one experiment on the devices at hand: advance, save, restore."""
+"""All lanes of one experiment on the devices at hand, of this process or of several: advance, save, restore."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import jax
 import numpy as np
-from jax.sharding import NamedSharding, PartitionSpec, Sharding
-from jaxtyping import Array, Float, Int, Key
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, Key
 
 from apt_jax import checkpoint
 from apt_jax.config import HParams
 from apt_jax.lanes import Layout, make_program, stack_hparams
 from apt_jax.specs import Params
 from apt_jax.trainer import Clock, Trainer, TrainState
+from experiments import processes
 from experiments.errors import UsageError
 from experiments.settings import Experiment
 
@@ -26,12 +27,19 @@ _PROPOSE_STREAM = 1_000_003
 
 
 class Runner:
-    """Holds the states of L lanes and the compiled functions that change them."""
+    """Holds the states of L lanes and the compiled functions that change them; processes call its methods together.
+
+    Raises:
+      UsageError: fewer lanes than processes.
+    """
 
     def __init__(self, trainer: Trainer, experiment: Experiment, layout: Layout, at_once: int | None = None):
         self._lanes = len(experiment.lanes)
         self._trainer = trainer
-        self._program = make_program(trainer, self._lanes, layout=layout, at_once=at_once)
+        try:
+            self._program = make_program(trainer, self._lanes, layout=layout, at_once=at_once)
+        except ValueError as error:
+            raise UsageError(str(error)) from error
         self._keys, self._hparams = lane_inputs(experiment)
         self._propose = jax.jit(jax.vmap(trainer.propose, in_axes=(0, 0, None, 0)), static_argnums=2)
         self._states: TrainState
@@ -47,7 +55,7 @@ class Runner:
         init = _compile(self._program.init, self._keys, self._hparams)
         seconds = time.monotonic() - began
         self._states = init(self._keys, self._hparams)
-        self._clock = jax.device_put(Clock.start(), _replicated(self._states))
+        self._clock = jax.device_put(Clock.start(), NamedSharding(self._mesh, PartitionSpec()))
         return seconds
 
     def compile(self) -> float:
@@ -67,36 +75,45 @@ class Runner:
         """One chunk; returns its metrics once they are there."""
         self._states, self._clock, metrics = self._chunk(self._states, self._clock, self._hparams)
         self.env_steps = int(self._clock.env_steps)
-        return jax.device_get(metrics)
+        return self._gather(metrics)
 
     def propose(self, n: int) -> Params:
         """`n` tasks that each lane's curriculum would generate now, leaves [L, n, ...]."""
         keys = jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, _PROPOSE_STREAM), self.env_steps))(self._keys)
-        rows = self._states.key.shape[0]
-        keys, hparams = jax.tree.map(lambda x: _pad(x, rows), (keys, self._hparams))
-        w = self._propose(self._states, keys, n, hparams)
-        return self._first(w)
+        lanes = _padded(self._lanes, self._rows)
+        keys, hparams = jax.tree.map(lambda x: x[lanes], (keys, self._hparams))
+        return self._gather(self._propose(self._states, keys, n, hparams))
 
-    @property
     def policies(self) -> Any:
         """Q-network parameters, leaves [L, ...]."""
-        return self._first(self._states.learner.params)
+        return self._gather(self._states.learner.params)
 
     def save(self, directory: Path) -> None:
-        """A checkpoint of the L lanes and the clock, whatever they are padded to on these devices."""
-        tree = (self._first(self._states), self._clock)
-        checkpoint.save(directory, self.env_steps, jax.device_put(tree, jax.devices()[0]))
+        """A checkpoint of the lanes, as they are padded on these devices, and the clock."""
+        checkpoint.save(directory, self.env_steps, (self._states, self._clock))
 
     def restore(self, directory: Path) -> None:
-        """Goes on from a checkpoint, also one from a machine with other devices."""
-        states, self._clock = load_states(directory, self._trainer, self._keys, self._hparams, self._clock.env_steps.sharding)
-        shardings = jax.tree.map(lambda x: x.sharding, self._states)
-        self._states = jax.jit(partial(_pad, length=self._states.key.shape[0]), out_shardings=shardings)(states)
+        """Goes on from a checkpoint, also one from other devices or of another number of processes."""
+        states, self._clock = load_states(directory, self._trainer, self._keys, self._hparams, self._mesh)
+        if states.key.shape[0] != self._rows:
+            lanes = _padded(self._lanes, self._rows)
+            shardings = jax.tree.map(lambda x: x.sharding, self._states)
+            states = jax.jit(lambda tree: jax.tree.map(lambda x: x[lanes], tree), out_shardings=shardings)(states)
+        self._states = states
         self.env_steps = int(self._clock.env_steps)
 
-    def _first(self, tree: Any) -> Any:
-        """Without the lanes that only pad."""
-        return _take(tree, np.arange(self._lanes))
+    @property
+    def _rows(self) -> int:
+        """How many lanes there are with those that only pad."""
+        return self._states.key.shape[0]
+
+    @property
+    def _mesh(self) -> Mesh:
+        return cast(Mesh, cast(NamedSharding, self._states.key.sharding).mesh)
+
+    def _gather(self, tree: Any) -> Any:
+        """Leaves [L, ...] as numpy, without the lanes that only pad."""
+        return jax.tree.map(lambda x: x[: self._lanes], processes.gather(tree))
 
 
 def lane_inputs(experiment: Experiment) -> tuple[Key[Array, "L"], HParams]:
@@ -106,36 +123,37 @@ def lane_inputs(experiment: Experiment) -> tuple[Key[Array, "L"], HParams]:
 
 
 def load_states(
-    directory: Path, trainer: Trainer, keys: Key[Array, "L"], hparams: HParams, sharding: Sharding
+    directory: Path, trainer: Trainer, keys: Key[Array, "L"], hparams: HParams, mesh: Mesh
 ) -> tuple[TrainState, Clock]:
-    """The states of a checkpoint, leaves [L, ...], and its clock, both placed by `sharding`.
+    """The states of a checkpoint, padded as they were saved (leaves [R, ...], R >= L), and its clock, on the devices of a mesh.
 
     Raises:
       UsageError: there is none, or it cannot be read.
     """
-    shapes = jax.eval_shape(jax.vmap(trainer.init), keys, hparams), jax.eval_shape(Clock.start)
-    placed = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes)
+    states, clock = jax.eval_shape(jax.vmap(trainer.init), keys, hparams), jax.eval_shape(Clock.start)
     try:
-        return checkpoint.restore(directory, placed)
+        rows = checkpoint.rows(directory)
+        by_lane, shared = NamedSharding(_even(mesh, rows), PartitionSpec("lane")), NamedSharding(mesh, PartitionSpec())
+        template = (
+            jax.tree.map(lambda x: jax.ShapeDtypeStruct((rows, *x.shape[1:]), x.dtype, sharding=by_lane), states),
+            jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=shared), clock),
+        )
+        return checkpoint.restore(directory, template)
     except checkpoint.CheckpointError as error:
         raise UsageError(str(error)) from error
 
 
-def _replicated(states: TrainState) -> NamedSharding:
-    """The placement of what all lanes share, on the devices of `states`."""
-    return NamedSharding(cast(NamedSharding, states.key.sharding).mesh, PartitionSpec())
+def _even(mesh: Mesh, rows: int) -> Mesh:
+    """The devices of a mesh, in groups that hold copies if `rows` cannot be divided by all of them."""
+    groups = math.gcd(rows, mesh.size)
+    if groups == mesh.size:
+        return mesh
+    return Mesh(mesh.devices.reshape(groups, -1), ("lane", "copy"))
 
 
-def _pad(tree: Any, length: int) -> Any:
-    """Repeats the last lane up to `length` lanes."""
-    lanes = jax.tree.leaves(tree)[0].shape[0]
-    return _take(tree, np.minimum(np.arange(length), lanes - 1))
-
-
-@jax.jit
-def _take(tree: Any, lanes: Int[Array, "N"]) -> Any:
-    """Lanes of every leaf; one compiled call, because one per leaf shape costs seconds."""
-    return jax.tree.map(lambda x: x[lanes], tree)
+def _padded(lanes: int, rows: int) -> np.ndarray:
+    """The lane of each row: the last one pads."""
+    return np.minimum(np.arange(rows), lanes - 1)
 
 
 def _compile(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:

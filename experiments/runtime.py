@@ -36,6 +36,7 @@ def describe() -> dict[str, object]:
         "packages": {name: _version(name) for name in _PACKAGES},
         "device_kind": devices[0].device_kind,
         "devices": len(devices),
+        "processes": jax.process_count(),
         "git_commit": _git_commit(),
     }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -63,6 +64,11 @@ class Session:
       layout: how the lanes of one device are laid out.
       at_once: lanes of a device side by side under layout vmap, the others in turn, if all do not fit its memory.
       devices: devices the host CPU counts as, by default one per core; lanes are spread over them.
+      distributed: this is one of several processes, each started with the same options, that share lanes and run directory; on
+        SLURM, Open MPI, Kubernetes and TPU pods they find each other, elsewhere with the next three options.
+      coordinator_address: host and port at which the first process can be reached.
+      num_processes: how many processes there are.
+      process_id: which one this is, from 0.
       sinks: also log there.
       checkpoint_every: environment steps between checkpoints.
     """
@@ -74,6 +80,10 @@ class Session:
     layout: Layout = "auto"
     at_once: int | None = None
     devices: int | None = None
+    distributed: bool = False
+    coordinator_address: str | None = None
+    num_processes: int | None = None
+    process_id: int | None = None
     sinks: tuple[SinkName, ...] = ()
     checkpoint_every: int = 10_000
 
@@ -82,10 +92,12 @@ class Session:
         """What to type to go on in the same way; the experiment itself is in the run directory."""
         words = ["python", "-m", "experiments.train", "--run-dir", str(self.run_dir), "--resume"]
         default = Session(self.run_dir)
-        for name in ("layout", "at_once", "devices", "sinks", "checkpoint_every"):
+        decided = ("run_dir", "resume", "preset", "method")
+        for name in (field.name for field in dataclasses.fields(self) if field.name not in decided):
             value = getattr(self, name)
             if value != getattr(default, name):
-                words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else [value])]
+                words.append(f"--{name.replace('_', '-')}")
+                words += [] if value is True else map(str, value if isinstance(value, tuple) else [value])
         return shlex.join(words)
 
 
@@ -158,6 +170,21 @@ def check(experiment: Experiment, session: Session) -> None:
         value = getattr(session, name)
         if value is not None and value < 1:
             raise UsageError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
+    check_processes(session)
+
+
+def check_processes(session: Session) -> None:
+    """Raises a `UsageError` for processes that cannot find each other."""
+    address, count, own = session.coordinator_address, session.num_processes, session.process_id
+    given = [value for value in (address, count, own) if value is not None]
+    if given and not session.distributed:
+        raise UsageError("--coordinator-address, --num-processes and --process-id need --distributed")
+    if address is not None and not re.fullmatch(r".+:\d+", address):
+        raise UsageError(f"--coordinator-address must be a host and a port as in node1:1234, got {address}")
+    if count is not None and count < 1:
+        raise UsageError(f"--num-processes must be at least 1, got {count}")
+    if own is not None and not 0 <= own < (count or own + 1):
+        raise UsageError(f"--process-id must be from 0 to --num-processes less 1, got {own} of {count}")
 
 
 def check_resumable(saved: Experiment, asked: Experiment) -> None:

@@ -1,6 +1,7 @@
 """Train one method on one target task, all seeds at once: `python -m experiments.train --run-dir DIR`.
 
-Interrupt it with Ctrl-C or SIGTERM at any time: it finishes the chunk at hand, saves, and says how to go on.
+Interrupt it with Ctrl-C or SIGTERM at any time: it finishes the chunk at hand, saves, and says how to go on.  Started once per
+host with --distributed, the processes share the lanes; interrupting one of them is enough.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from apt_jax import checkpoint
-from experiments import pictures, run_dir, runtime
+from experiments import pictures, processes, run_dir, runtime
 from experiments.errors import exit_with
 from experiments.interrupt import EXIT_CODE, Interrupt
 from experiments.problem import make_problem
-from experiments.progress import View, make_view
+from experiments.progress import Metrics, View, make_view
 from experiments.run_dir import RunDir
 from experiments.runner import Runner
 from experiments.settings import Experiment, Session, parse
@@ -34,17 +35,28 @@ TASKS_EVERY = 5
 def main() -> int:
     """The command line."""
     experiment, session = parse()
-    runtime.setup(session.devices)
+    start_jax(session)
     return train(experiment, session)
+
+
+def start_jax(session: Session) -> None:
+    """What has to come before the first array: settings, and meeting the other processes if there are any."""
+    runtime.setup(session.devices)
+    if session.distributed:
+        processes.join(session.coordinator_address, session.num_processes, session.process_id)
 
 
 def train(experiment: Experiment, session: Session) -> int:
     """Trains until `experiment.env_steps` or an interrupt; returns the exit code."""
     problem = make_problem(experiment)
     check_installed(session.sinks)
-    run = open_run(experiment, session)
-    if is_complete(run.path, experiment):
-        print(f"{run.path} has all its {experiment.env_steps:,} steps; pass a larger --env-steps to go on")
+    processes.check_same(repr((experiment, dataclasses.replace(session, process_id=None))))
+    runner = Runner(problem.trainer, experiment, session.layout, session.at_once)
+    run = RunDir(session.run_dir)
+    start = processes.from_first(lambda: open_run(experiment, session))
+    if processes.from_first(lambda: is_complete(run.path, experiment)):
+        if processes.is_first():
+            print(f"{run.path} has all its {experiment.env_steps:,} steps; pass a larger --env-steps to go on")
         return 0
     names = [lane.name for lane in experiment.lanes]
     with (
@@ -56,14 +68,14 @@ def train(experiment: Experiment, session: Session) -> int:
             f"{experiment.config.method} on {experiment.space}, seeds {' '.join(map(str, experiment.seeds))}, "
             f"{len(names)} lanes, into {run.path}"
         )
-        sinks = [stack.enter_context(closing(sink)) for sink in open_sinks(experiment, session, run)]
+        sinks = [stack.enter_context(closing(sink)) for sink in open_sinks(experiment, session, start)]
         times = Times(before=run_dir.wall_seconds(run.path))
-        runner = Runner(problem.trainer, experiment, session.layout, session.at_once)
-        Training(experiment, session, runner, run, view, sinks, interrupt, times).run()
+        Training(experiment, session, runner, run, view, sinks, interrupt, times).run(start)
         view.stop()
-        if run_dir.wall_seconds(run.path):
+        policies = runner.policies()
+        if processes.is_first() and run_dir.wall_seconds(run.path):
             run.write_json("summary.json", summarise(run.path, experiment, times))
-            pictures.draw(run.path, experiment, problem, runner.policies)
+            pictures.draw(run.path, experiment, problem, policies)
         if runner.env_steps < experiment.env_steps:
             view.note(f"stopped at {runner.env_steps:,} steps; to go on: {session.resume_command}")
             return EXIT_CODE
@@ -71,21 +83,23 @@ def train(experiment: Experiment, session: Session) -> int:
         return 0
 
 
-def open_sinks(experiment: Experiment, session: Session, run: RunDir) -> list[Sink]:
-    """The sinks asked for, which go on where the run does."""
-    start = checkpoint.latest_step(run.checkpoints) or 0
-    return make_sinks(session.sinks, run.path, start=start, lanes=experiment.lanes, config=dataclasses.asdict(experiment))
+def open_sinks(experiment: Experiment, session: Session, start: int) -> list[Sink]:
+    """The sinks asked for, which go on where the run does; none in any process but the first."""
+    names = session.sinks if processes.is_first() else ()
+    return make_sinks(names, session.run_dir, start=start, lanes=experiment.lanes, config=dataclasses.asdict(experiment))
 
 
-def open_run(experiment: Experiment, session: Session) -> RunDir:
-    """A new run directory, or the one to resume, as it was at its checkpoint."""
+def open_run(experiment: Experiment, session: Session) -> int:
+    """Makes a new run directory, or the one to resume as it was at its checkpoint; returns that one's steps, 0 without any."""
     config = dataclasses.asdict(experiment)
     if not session.resume:
-        return RunDir.create(session.run_dir, config, experiment.target_file)
+        RunDir.create(session.run_dir, config, experiment.target_file)
+        return 0
     run = RunDir(session.run_dir)
-    run.rewind(checkpoint.latest_step(run.checkpoints) or 0)
+    start = checkpoint.latest_step(run.checkpoints) or 0
+    run.rewind(start)
     run.write_json("config.json", {**config, "target_file": run_dir.read_config(run.path)["target_file"]})
-    return run
+    return start
 
 
 @dataclass
@@ -101,30 +115,26 @@ class Training:
     interrupt: Interrupt
     times: Times
 
-    def run(self) -> None:
-        """From the checkpoint, or the start, to the end or an interrupt; the last chunk is always saved."""
-        self._begin()
+    def run(self, start: int) -> None:
+        """From the checkpoint of `start` steps, if any, to the end or an interrupt; the last chunk is always saved."""
+        self._begin(start)
         going = self._unfinished()
         while going:
             began = time.monotonic()
             metrics = self._patiently(self.runner.advance)
             self.times.training += time.monotonic() - began
             self.times.trained_steps += self.experiment.config.eval_every
-            index = [lane.index for lane in self.experiment.lanes]
-            self.run_dir.append_metrics(self.runner.env_steps, self.times.wall, index, metrics)
-            self.view.write(self.runner.env_steps, metrics)
-            for sink in self.sinks:
-                sink.write(self.runner.env_steps, metrics)
+            self._record(metrics)
             going = self._unfinished()  # asked once, so that an interrupt cannot slip in between saving and leaving
             if not going or self._due(TASKS_EVERY * self.experiment.config.eval_every):
                 self._sample_tasks()
             if not going or self._due(self.session.checkpoint_every):
                 self.runner.save(self.run_dir.checkpoints)
 
-    def _begin(self) -> None:
+    def _begin(self, start: int) -> None:
         self.view.note("compiling; the result is kept for later runs")
         self.times.compile = self._patiently(self.runner.init)
-        if checkpoint.latest_step(self.run_dir.checkpoints) is not None:
+        if start:
             self.runner.restore(self.run_dir.checkpoints)
             self.view.note(f"restored {self.runner.env_steps:,} steps")
         if self._unfinished():
@@ -136,15 +146,25 @@ class Training:
         self.view.start(self.runner.env_steps)
 
     def _unfinished(self) -> bool:
-        return self.runner.env_steps < self.experiment.env_steps and not self.interrupt.requested
+        return self.runner.env_steps < self.experiment.env_steps and not processes.any_of(self.interrupt.requested)
 
     def _due(self, every: int) -> bool:
         """Whether the chunk at hand reached a multiple of `every`."""
         return self.runner.env_steps % every < self.experiment.config.eval_every
 
+    def _record(self, metrics: Metrics) -> None:
+        if processes.is_first():
+            index = [lane.index for lane in self.experiment.lanes]
+            self.run_dir.append_metrics(self.runner.env_steps, self.times.wall, index, metrics)
+        self.view.write(self.runner.env_steps, metrics)
+        for sink in self.sinks:
+            sink.write(self.runner.env_steps, metrics)
+
     def _sample_tasks(self) -> None:
         if self.runner.generates:
-            self.run_dir.write_tasks(self.runner.env_steps, self.runner.propose(TASKS_PER_LANE))
+            w = self.runner.propose(TASKS_PER_LANE)
+            if processes.is_first():
+                self.run_dir.write_tasks(self.runner.env_steps, w)
 
     def _patiently(self, work: Callable[[], T]) -> T:
         """Does long work and stays able to answer an interrupt."""

@@ -73,6 +73,16 @@ def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path: Path, fault: str) -
     gc.collect()  # coroutines that orbax leaves behind complain here, not in another test
 
 
+def test_rows_are_the_leading_axis_that_all_arrays_share(tmp_path: Path) -> None:
+    tree = make_tree()
+    del tree["board"]
+    checkpoint.save(tmp_path, 1, tree)
+    assert checkpoint.rows(tmp_path) == 3
+    checkpoint.save(tmp_path, 2, make_tree())
+    with pytest.raises(checkpoint.CheckpointError, match=r"checkpoint 2 .* cannot be restored"):
+        checkpoint.rows(tmp_path)
+
+
 def test_arrays_are_placed_as_the_template_says(tmp_path: Path) -> None:
     mesh = jax.make_mesh((1,), ("lanes",))
     sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("lanes"))

@@ -36,9 +36,26 @@ def test_a_plan_has_a_run_per_method_and_target_and_goes_on_with_what_is_there(t
         compare.plan(comparison, ["--preset", "fast", "--seeds", "7"])
 
 
+def test_seeds_are_split_over_jobs_and_put_together_again(tmp_path):
+    comparison = Compare(tmp_path, methods=("dqn",), seeds_per_job=2)
+    runs = compare.plan(comparison, ["--preset", "fast", "--seeds", "4", "2", "9"])
+    assert [experiment.seeds for experiment, _ in runs] == [(4, 2), (9,)]
+    for experiment, session in runs:
+        train.open_run(experiment, session)
+        metrics = {name: np.float32(experiment.seeds) for name in ("target_return", "target_return_raw")}
+        RunDir(session.run_dir).append_metrics(1_000, 0.5, [lane.index for lane in experiment.lanes], metrics)
+    parts = compare.run_parts(comparison, "dqn", "A")
+    curves = report.read_parts("dqn", parts)["dqn"][1]
+    np.testing.assert_array_equal(curves["target_return"], [[4], [2], [9]])
+    with pytest.raises(UsageError, match="not the seeds of one run"):
+        report.read_parts("dqn", [*parts, parts[0]])
+
+
 @pytest.mark.parametrize(
     ("changes", "options", "message"),
     [
+        ({"seeds_per_job": 0}, [], "--seeds-per-job must be at least 1, got 0"),
+        ({"ray": True}, ["--distributed"], "--ray and --distributed exclude each other"),
         ({}, ["--run-dir", "x"], "--run-dir is decided for every run"),
         ({}, ["--config.method", "dqn"], "--config.method is decided"),
         ({"methods": ()}, [], "at least one name"),

@@ -49,6 +49,9 @@ def start_run(path: Path, *options: str) -> Experiment:
         ("--at-once 0", "--at-once must be at least 1"),
         ("--method apt_gen+rdn", "closest is 'rnd'"),
         ("--devices 0", "--devices must be at least 1"),
+        ("--num-processes 2", "--num-processes and --process-id need --distributed"),
+        ("--distributed --coordinator-address node1", "must be a host and a port as in node1:1234, got node1"),
+        ("--distributed --num-processes 2 --process-id 2", "--process-id must be from 0 to .* got 2 of 2"),
         ("--checkpoint-every 0", "--checkpoint-every must be at least 1"),
         ("--target-file missing.txt", "missing.txt is no file"),
         ("--env-steps 10000", r"warmup_steps \(10000\) .* is 11000"),
@@ -197,7 +200,8 @@ def test_tensorboard_writes_events(tmp_path):
     assert list((tmp_path / "tensorboard").glob("events*"))
 
 
-def test_an_interrupted_run_resumes_as_if_nothing_happened(tmp_path, capsys):
+def test_an_interrupted_run_says_how_to_go_on_and_ends_complete(tmp_path, capsys):
+    """That it ends like one that was never interrupted, `test_resuming` shows."""
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache"), "JAX_PLATFORMS": "cpu"}
 
     def launch(*options: str) -> subprocess.Popen[str]:
@@ -213,19 +217,14 @@ def test_an_interrupted_run_resumes_as_if_nothing_happened(tmp_path, capsys):
     assert process.returncode == 130
     command = re.search(r"to go on: python -m experiments.train (.*)", rest)
     assert command
-    assert len(rows_without_time(run)) < 3 * 10
+    assert len(rows(run)) < 3 * 10
     with (run / "metrics.csv").open("a") as stream:
         stream.write("3,1")  # as a process killed while writing leaves it
 
     with launch(*shlex.split(command[1])) as process:
         process.communicate()
     assert process.returncode == 0
-    with launch("--run-dir", str(tmp_path / "whole"), *TINY) as process:
-        process.communicate()
-    assert process.returncode == 0
-
-    assert rows_without_time(run) == rows_without_time(tmp_path / "whole")
-    assert len(rows_without_time(run)) == 3 * 10
+    assert rows(run) == [(seed, step) for step in range(300, 1300, 100) for seed in (3, 0, 5)]
     summary = json.loads((run / "summary.json").read_text())
     assert [lane["seed"] for lane in summary["lanes"]] == [3, 0, 5]
     for name in ("learning_curves.png", "progression.png", "policy.gif", "tasks/seed_3.png"):
@@ -238,9 +237,9 @@ def test_an_interrupted_run_resumes_as_if_nothing_happened(tmp_path, capsys):
     assert (tmp_path / "film.gif").exists()
 
 
-def rows_without_time(path: Path) -> list[dict[str, str]]:
+def rows(path: Path) -> list[tuple[int, int]]:
     with (path / "metrics.csv").open() as stream:
-        return [{name: value for name, value in row.items() if name != "wall_seconds"} for row in csv.DictReader(stream)]
+        return [(int(row["seed"]), int(row["env_steps"])) for row in csv.DictReader(stream)]
 
 
 def test_the_default_config_is_the_papers():

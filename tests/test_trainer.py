@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import PartitionSpec
 
 import envs
 from apt_jax import checkpoint
 from apt_jax.config import PRESETS, Config, HParams
-from apt_jax.lanes import make_program, stack_hparams
+from apt_jax.lanes import _spread, make_program, stack_hparams
 from apt_jax.methods import METHODS, Method, parse_method
 from apt_jax.trainer import Clock, diversity, make_trainer
 from tests.corridor import Corridor
@@ -126,7 +128,9 @@ def test_diversity_sees_a_collapse_of_one_modality():
 @pytest.mark.parametrize("layout", ["map", "vmap"])
 def test_a_seed_alone_equals_the_same_seed_among_others(layout):
     """Float reassociation is the only difference allowed; on two devices three lanes also exercise the padding."""
-    several, _, _ = run(config("apt_gen"), [3, 4, 5], layout=layout)
+    several, _, history = run(config("apt_gen"), [3, 4, 5], layout=layout)
+    # Metrics stay on the devices of their lanes: to bring them together, devices would have to wait for each other.
+    assert all(value.sharding.spec == PartitionSpec("lane") for value in history[0].values())
     for lane, seed in enumerate([3, 4, 5]):
         alone, _, _ = run(config("apt_gen"), [seed])
         assert_lane_equal(several, lane, alone)
@@ -154,6 +158,19 @@ def test_lanes_may_be_laid_out_in_groups():
         np.testing.assert_allclose(a[:5], b[:5], rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match="at least one lane and one at once, got 5 and 0"):
         make_program(trainer, 5, at_once=0)
+
+
+class Device(NamedTuple):
+    id: int
+    process_index: int
+
+
+def test_fewer_lanes_than_devices_are_shared_by_all_processes():
+    devices = [Device(i, process_index=i // 3) for i in range(6)]
+    assert [device.process_index for device in _spread(devices, 3)] == [0, 0, 1]
+    assert _spread(devices, 9) == devices
+    with pytest.raises(ValueError, match=r"2 processes need at least a lane each .* got 1"):
+        _spread(devices, 1)
 
 
 def test_a_method_is_a_curriculum_and_a_bonus():
