@@ -19,7 +19,15 @@ from apt_jax.specs import Obs, obs_struct, zeros_like
 
 
 class LearnerState(NamedTuple):
-    """Online and target parameters and the state of Adam."""
+    """What is learned of the Q-function.
+
+    Attributes:
+      params: the online network's, which collects.
+      target_params: their Polyak average, for targets, and for judging the policy.  Values of actions differ by about
+        1 - gamma, less than an update moves them: the greedy policy of the online network falls into loops and out of them
+        from update to update, that of the average does not (experiments/NOTES.md, section 8).
+      opt_state: Adam's.
+    """
 
     params: Any
     target_params: Any

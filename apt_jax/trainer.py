@@ -196,7 +196,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         return jax.lax.scan(step, (state, clock), length=config.warmup_steps // steps)[0]
 
     def evaluate(state: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Metrics]:
-        """Greedy return on the target, the restore rule, and the curriculum judged on fresh tasks.
+        """Greedy return on the target, the restore rule, and the curriculum judged on fresh tasks, by the averaged policy.
 
         Draws from `key_eval` alone, so that evaluating more or less often changes nothing in training.
         """
@@ -211,7 +211,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             epsilon = jnp.concatenate([epsilon, jnp.full(config.probe_tasks, explores)])
 
         def act(obs: Obs, key: Key[Array, ""]) -> Int[Array, "n"]:
-            return learner.epsilon_greedy(network, state.learner.params, obs, key, epsilon)
+            return learner.epsilon_greedy(network, state.learner.target_params, obs, key, epsilon)
 
         # All side by side: the environments' step is compiled and looped over once.
         played = evaluation.play(space, tasks, act, key_play)

@@ -66,7 +66,7 @@ def evaluate(args: Args) -> None:
     keys, hparams = lane_inputs(experiment)
     here = Mesh(np.array(jax.devices()[:1]), ("lane",))
     states, clock = load_states(RunDir(args.run_dir).checkpoints, problem.trainer, keys, hparams, here)
-    policies = jax.tree.map(lambda x: x[: len(experiment.lanes)], states.learner.params)
+    policies = jax.tree.map(lambda x: x[: len(experiment.lanes)], states.learner.target_params)
     key_score, key_film = jax.random.split(jax.random.key(args.seed))
     outcome = episodes.score(problem.trainer, policies, problem.target, episodes=args.episodes, key=key_score)
     names = [lane.name for lane in experiment.lanes]

@@ -85,8 +85,8 @@ class Runner:
         return self._gather(self._propose(self._states, keys, n, hparams))
 
     def policies(self) -> Any:
-        """Q-network parameters, leaves [L, ...]."""
-        return self._gather(self._states.learner.params)
+        """Averaged Q-network parameters, leaves [L, ...]: what evaluations judge."""
+        return self._gather(self._states.learner.target_params)
 
     def save(self, directory: Path) -> None:
         """A checkpoint of the lanes, as they are padded on these devices, and the clock."""

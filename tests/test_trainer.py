@@ -96,6 +96,18 @@ def test_every_method_makes_a_program(method):
     assert "target_return" in metrics
 
 
+def test_the_averaged_policy_is_judged():
+    """Made to go right always, while the online network knows nothing and learns nothing."""
+    hparams = [HParams(learning_rate=0.0, target_rate=0.0)] * 2
+    states, clock, history = run(config("dqn"), [0, 1], hparams=hparams)
+    assert np.all(history[-1]["target_return_raw"] < 0.0)
+    averaged = jax.tree.map(jnp.zeros_like, states.learner.target_params)
+    averaged["params"]["head"]["output"]["bias"] = jnp.tile(jnp.array([0.0, 1.0]), (2, 1))
+    states = states._replace(learner=states.learner._replace(target_params=averaged))
+    _, _, metrics = program(config("dqn"), 2, "map").chunk(states, clock, stack_hparams(hparams))
+    assert np.all(metrics["target_return_raw"] > 0.5)
+
+
 @pytest.mark.parametrize("method", ["apt_gen+rnd", "random", "dqn", "alp_gmm", "goal_gan", "ride"])
 def test_metrics_are_finite_and_the_clock_counts_every_source(method):
     """With everything switched on; the other tests run the paper's form."""
