@@ -87,10 +87,10 @@ def main() -> int:
     ladder = build(problem.target)
     here = Mesh(np.array(jax.devices()[:1]), ("lane",))
     checkpoints = run_dir.RunDir(args.run_dir).checkpoints
-    states, clock = load_states(checkpoints, problem.trainer, *lane_inputs(experiment), here)
+    keys, hparams = lane_inputs(experiment)
+    states, clock = load_states(checkpoints, problem.trainer, keys, hparams, here)
     lanes = len(experiment.lanes)
     states = jax.tree.map(lambda x: x[:lanes], states)
-    _, hparams = lane_inputs(experiment)
     judged = judge(problem.trainer, states, hparams, choose(ladder, args.tasks, args.seed), jax.random.key(args.seed))
     judged = jax.tree.map(lambda x: np.asarray(x).reshape(lanes, len(ladder.steps), args.tasks), judged)
     print(f"{args.run_dir} after {int(clock.env_steps):,} steps; means over lanes and tasks\n")
