@@ -1,7 +1,5 @@
 """A hand-made curriculum towards each of Grid-World's targets, the yardstick for those that are learned.
 
-    python -m experiments.train --plugins experiments.ladder --method ladder_B --target B --run-dir DIR
-
 Its tasks are the target with the goal, and perhaps one key, moved to a place on the target's own shortest solution.  Those
 that take equally many steps are a rung.  Half of the tasks come from the rung at hand, half from it and all below.
 """
@@ -9,7 +7,6 @@ that take equally many steps are a rung.  Half of the tasks come from the rung a
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -19,9 +16,7 @@ from jaxtyping import Array, Float, Int, Key
 
 import envs
 from apt_jax.config import Config, HParams
-from apt_jax.curricula import CURRICULA
 from apt_jax.curricula.base import GENERATED, Curriculum, Metrics, no_update
-from apt_jax.methods import METHODS, Method
 from apt_jax.replay import Replay, Rollouts, latest_episodes
 from apt_jax.specs import Params
 from apt_jax.task_space import TaskSpace
@@ -114,8 +109,3 @@ def make(space: TaskSpace, config: Config, *, target: str) -> Curriculum:
         return {"ladder_steps": jnp.asarray(ladder.steps)[state]}
 
     return Curriculum(True, init, propose, no_update, refresh, report)
-
-
-for _name in envs.SPACES["grid_world"]().targets:
-    CURRICULA[f"ladder_{_name}"] = partial(make, target=_name)
-    METHODS[f"ladder_{_name}"] = Method(f"ladder_{_name}")

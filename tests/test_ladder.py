@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,12 +12,15 @@ import pytest
 import envs
 from apt_jax import replay as rp
 from apt_jax.config import Config, HParams
+from apt_jax.curricula import CURRICULA
+from apt_jax.methods import METHODS
 from envs.grid_world.placement import parameter, place
 from envs.grid_world.solver import solve
 from experiments import ladder, settings, train
 from experiments.problem import make_problem
 
 SPACE = envs.make("grid_world")
+PLUGIN = "experiments.ladder_methods"
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +35,18 @@ def test_a_target_is_made_of_its_parameter(name):
     jax.tree.map(np.testing.assert_array_equal, place(parameter(target)), target)
 
 
-def test_a_plug_in_adds_its_methods_to_a_run_and_is_remembered_by_it(tmp_path):
-    options = ["--plugins", "experiments.ladder", "--method", "ladder_C", "--target", "C"]
+def test_a_plug_in_adds_its_methods_to_a_run_and_is_remembered_by_it(tmp_path, monkeypatch):
+    for registry in (CURRICULA, METHODS):  # both are as they were afterwards
+        monkeypatch.setitem(registry, "ladder_A", None)
+        monkeypatch.setitem(registry, "ladder_B", None)
+        monkeypatch.setitem(registry, "ladder_C", None)
+    monkeypatch.delitem(sys.modules, PLUGIN, raising=False)
+    options = ["--plugins", PLUGIN, "--method", "ladder_C", "--target", "C"]
     experiment, session = settings.parse(["--run-dir", str(tmp_path), *options])
     make_problem(experiment)
     train.open_run(experiment, session)
     assert settings.load(tmp_path) == experiment
-    assert settings.parse(["--run-dir", str(tmp_path), "--resume"])[0].plugins == ("experiments.ladder",)
+    assert settings.parse(["--run-dir", str(tmp_path), "--resume"])[0].plugins == (PLUGIN,)
 
 
 def test_rungs_lead_from_one_step_to_the_target(climbing):
