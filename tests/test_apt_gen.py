@@ -42,6 +42,21 @@ def experience():
     return jax.tree.map(lambda x: x[0], states.replay), clock.iteration - 1
 
 
+def train(curriculum, state, experience, hparams, rounds):
+    """The state after some updates on the same experience, and the metrics of each."""
+    replay, iteration = experience
+
+    @jax.jit
+    def updates(state):
+        return jax.lax.scan(
+            lambda state, key: curriculum.update(state, key, replay, iteration, hparams),
+            state,
+            jax.random.split(jax.random.key(1), rounds),
+        )
+
+    return updates(state)
+
+
 @pytest.mark.parametrize(
     ("beta", "weights", "optimum"),
     [
@@ -55,21 +70,14 @@ def experience():
 def test_generator_reaches_the_optimum_of_v1_plus_beta_v2(monkeypatch, experience, beta, weights, optimum):
     """V1 peaks at 2 and V2 at 8, so the sum peaks at (2 + 8 beta) / (1 + beta); an ablation leaves one of them."""
     monkeypatch.setattr(objectives, "ValueNetwork", Bowl)
-    replay, iteration = experience
     hparams = HParams(value_learning_rate=0.0, generator_learning_rate=1e-2, vector_noise=0.0)
     curriculum = apt_gen.make(SPACE, CONFIG, **weights)
     state = curriculum.init(jax.random.key(0), hparams)
     v1, v2 = ({"params": {"centre": jnp.full(1, c)}} for c in (2.0, 8.0))  # ensembles of one
     state = state._replace(models=state.models._replace(progress_value=v1, return_value=v2), beta=jnp.float32(beta))
 
-    @jax.jit
-    def train(state):
-        def update(state, key):
-            return curriculum.update(state, key, replay, iteration, hparams)[0], None
-
-        return jax.lax.scan(update, state, jax.random.split(jax.random.key(1), 400))[0]
-
-    goal = curriculum.propose(train(state), jax.random.key(2), 256, hparams)["goal"]
+    trained, _ = train(curriculum, state, experience, hparams, rounds=400)
+    goal = curriculum.propose(trained, jax.random.key(2), 256, hparams)["goal"]
     np.testing.assert_allclose(jnp.mean(goal), optimum, atol=0.3)
 
 
@@ -86,38 +94,23 @@ class Indifferent(nn.Module):
 @pytest.mark.parametrize(("prior", "mean", "deviation"), [(0.0, 8.98, 0.0), (0.03, 4.5, 1.9)])
 def test_prior_brings_a_number_back_from_the_end_of_its_range(monkeypatch, experience, prior, mean, deviation):
     monkeypatch.setattr(objectives, "ValueNetwork", Indifferent)
-    replay, iteration = experience
     hparams = HParams(value_learning_rate=0.0, generator_learning_rate=2e-2, vector_prior=prior)
     curriculum = apt_gen.make(SPACE, CONFIG)
     state = curriculum.init(jax.random.key(0), hparams)
     norm = state.models.generator["goal"][OUTPUT_NORM]
     norm["bias"], norm["scale"] = jnp.full(1, 6.0), jnp.full(1, 0.05)
 
-    @jax.jit
-    def train(state):
-        def update(state, key):
-            return curriculum.update(state, key, replay, iteration, hparams)[0], None
-
-        return jax.lax.scan(update, state, jax.random.split(jax.random.key(1), 1000))[0]
-
-    goal = curriculum.propose(train(state), jax.random.key(2), 512, hparams)["goal"]
+    trained, _ = train(curriculum, state, experience, hparams, rounds=1000)
+    goal = curriculum.propose(trained, jax.random.key(2), 512, hparams)["goal"]
     np.testing.assert_allclose((jnp.mean(goal), jnp.std(goal)), (mean, deviation), atol=0.2)
 
 
 def test_discriminator_and_values_learn_from_the_same_experience(experience):
-    replay, iteration = experience
     hparams = HParams(discriminator_learning_rate=3e-3, value_learning_rate=3e-3, generator_learning_rate=0.0)
     curriculum = apt_gen.make(SPACE, CONFIG)
     state = curriculum.init(jax.random.key(0), hparams)
 
-    @jax.jit
-    def train(state):
-        def update(state, key):
-            return curriculum.update(state, key, replay, iteration, hparams)
-
-        return jax.lax.scan(update, state, jax.random.split(jax.random.key(1), 400))
-
-    trained, metrics = train(state)
+    trained, metrics = train(curriculum, state, experience, hparams, rounds=400)
     late = jax.tree.map(lambda x: np.mean(x[-50:]), metrics)
     assert late["discriminator_target_logit"] > 0.5 > -0.5 > late["discriminator_generated_logit"]
     assert late["v2_unexplained"] < 0.3
