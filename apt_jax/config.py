@@ -139,6 +139,9 @@ class Config:
       model_updates_per_step: updates of discriminator, values and generator per environment step (paper: 1).
       model_batch_size: rollouts per source in such an update (paper: 128).
       rollout_steps: transitions of each rollout that the discriminator sees in one update.
+      judge_parts: whether the discriminator judges the parts of a rollout one by one, as PatchGAN does those of a picture: the
+        initial observation and each transition are classified by themselves, and a rollout's score averages their probabilities,
+        the initial observation counting half.  Otherwise it judges rollouts, by the average of their parts' logits (paper).
       recent_steps: discriminator and values learn from the latest so many steps of each source (paper: 10,000).
       relative_progress: whether V1 learns from logits centred and scaled to unit spread over the batch, so that progress weighs
         the same against return however sure the discriminator is (paper: no).
@@ -172,6 +175,7 @@ class Config:
     model_updates_per_step: float = 1.0
     model_batch_size: int = 128
     rollout_steps: int = 4
+    judge_parts: bool = False
     recent_steps: int = 10_000
     relative_progress: bool = False
     blank_bias: float = 0.0

@@ -32,8 +32,8 @@ def td_errors(q: Float[Array, "B A"], action: Int[Array, "B"], target: Float[Arr
     return target - jnp.take_along_axis(q, action[:, None].astype(jnp.int32), axis=-1)[:, 0]
 
 
-def discriminator_loss(target_logit: Float[Array, "B"], generated_logit: Float[Array, "B"]) -> Float[Array, ""]:
-    """Binary cross-entropy of telling target rollouts from generated ones (paper, Eq. 4).
+def discriminator_loss(target_logit: Float[Array, "*B"], generated_logit: Float[Array, "*B"]) -> Float[Array, ""]:
+    """Binary cross-entropy of telling target rollouts, or parts of them, from generated ones (paper, Eq. 4).
 
     The paper prints the second term as 1 - log D, which is unbounded below and pushes hardest where D is already right; this
     is the standard -log(1 - D) of the cited GAN loss.

@@ -105,9 +105,10 @@ def test_prior_brings_a_number_back_from_the_end_of_its_range(monkeypatch, exper
     np.testing.assert_allclose((jnp.mean(goal), jnp.std(goal)), (mean, deviation), atol=0.2)
 
 
-def test_discriminator_and_values_learn_from_the_same_experience(experience):
+@pytest.mark.parametrize("judge_parts", [False, True])
+def test_discriminator_and_values_learn_from_the_same_experience(experience, judge_parts):
     hparams = HParams(discriminator_learning_rate=3e-3, value_learning_rate=3e-3, generator_learning_rate=0.0)
-    curriculum = apt_gen.make(SPACE, CONFIG)
+    curriculum = apt_gen.make(SPACE, dataclasses.replace(CONFIG, judge_parts=judge_parts))
     state = curriculum.init(jax.random.key(0), hparams)
 
     trained, metrics = train(curriculum, state, experience, hparams, rounds=400)

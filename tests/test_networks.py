@@ -15,6 +15,7 @@ from apt_jax.networks import (
     ValueNetwork,
     init_singular_vectors,
     pool,
+    pool_probabilities,
     spectral_normalize,
     vector_divergence,
 )
@@ -162,6 +163,13 @@ def test_pool_weighs_the_initial_logit_as_one_of_all_encodings():
     step_logits = jnp.array([[1.0, 3.0], [0.5, 1.5], [1.0, 1.0]])
     # (2 + 1 + 3) / 3;  (2 + 9 * 1) / 10;  (4 + 1) / 2
     np.testing.assert_allclose(pool(init_logit, step_logits, jnp.array([2, 9, 1])), [2.0, 1.1, 2.5], rtol=1e-6)
+
+
+def test_pooled_probabilities_count_the_initial_one_half():
+    logit = np.log([3.0, 1.0 / 3.0])  # probabilities of 3/4 and 1/4
+    pooled = pool_probabilities(jnp.array([logit[0], 100.0]), jnp.array([[logit[0], logit[1]], [-100.0, -100.0]]))
+    np.testing.assert_allclose(jax.nn.sigmoid(pooled), [0.5 * (0.75 + 0.5), 0.5], rtol=1e-6)
+    assert np.isfinite(pool_probabilities(jnp.array([100.0]), jnp.array([[100.0]]))).all()
 
 
 GENERATOR = Generator(PARAM_SPEC)

@@ -7,12 +7,20 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from apt_jax import losses
 from apt_jax import replay as rp
 from apt_jax.config import Config, HParams
-from apt_jax.networks import Discriminator, Generator, ValueNetwork, pool, spectral_normalize, vector_divergence
+from apt_jax.networks import (
+    Discriminator,
+    Generator,
+    ValueNetwork,
+    pool,
+    pool_probabilities,
+    spectral_normalize,
+    vector_divergence,
+)
 from apt_jax.networks.apply import apply
 from apt_jax.specs import Params, Spec, Vector
 from apt_jax.task_space import TaskSpace
@@ -67,7 +75,8 @@ def make_objectives(
         w, updated = apply(networks.generator, variables, z, train=True, mutable=["batch_stats"])
         return w, updated["batch_stats"]
 
-    def score(params: Any, rollouts: rp.Rollouts) -> Float[Array, "B"]:
+    def judge(params: Any, rollouts: rp.Rollouts) -> tuple[Float[Array, "B"], Float[Array, "B k"]]:
+        """The logits of each rollout's parts: its initial observation, its transitions."""
         steps = rollouts.steps
         initial = apply(networks.discriminator, params, rollouts.initial_obs, method="score_init")
         transitions = apply(
@@ -79,7 +88,13 @@ def make_objectives(
             next_obs=steps.next_obs,
             method="score_step",
         )
-        return pool(initial, transitions, rollouts.length)
+        return initial, transitions
+
+    def pooled(initial: Float[Array, "B"], transitions: Float[Array, "B k"], length: Int[Array, "B"]) -> Float[Array, "B"]:
+        return pool_probabilities(initial, transitions) if config.judge_parts else pool(initial, transitions, length)
+
+    def score(params: Any, rollouts: rp.Rollouts) -> Float[Array, "B"]:
+        return pooled(*judge(params, rollouts), rollouts.length)
 
     def evaluate(ensemble: Any, w: Params) -> Float[Array, "K n"]:
         seen = as_instantiated(space.param_spec, w)
@@ -90,8 +105,11 @@ def make_objectives(
     ) -> tuple[Float[Array, ""], Any]:
         normalised, spectral = spectral_normalize(params, spectral, bound=hparams.spectral_bound)
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), target, generated)
-        target_logit, generated_logit = jnp.split(score(normalised, both), 2)
-        return losses.discriminator_loss(target_logit, generated_logit), ((target_logit, generated_logit), spectral)
+        initial, transitions = judge(normalised, both)
+        logits = tuple(jnp.split(pooled(initial, transitions, both.length), 2))
+        judged = (initial, transitions) if config.judge_parts else (pooled(initial, transitions, both.length),)
+        loss = jnp.mean(jnp.stack([losses.discriminator_loss(*jnp.split(part, 2)) for part in judged]))
+        return loss, (logits, spectral)
 
     def value_loss(ensemble: Any, w: Params, outcome: Float[Array, "B"]) -> tuple[Float[Array, ""], Any]:
         errors = evaluate(ensemble, w) - outcome[None]

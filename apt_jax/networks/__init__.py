@@ -1,6 +1,6 @@
 """The paper's networks, built from specs (appendix "Network Architectures")."""
 
-from apt_jax.networks.discriminator import Discriminator, pool
+from apt_jax.networks.discriminator import Discriminator, pool, pool_probabilities
 from apt_jax.networks.distillation import Distillation
 from apt_jax.networks.dynamics import Dynamics
 from apt_jax.networks.generator import Generator, vector_divergence
@@ -17,6 +17,7 @@ __all__ = [
     "ValueNetwork",
     "init_singular_vectors",
     "pool",
+    "pool_probabilities",
     "spectral_normalize",
     "vector_divergence",
 ]

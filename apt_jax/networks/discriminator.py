@@ -62,3 +62,9 @@ def pool(
     """Estimates the average over the initial logit and all `length` step logits from a sample of k of the latter."""
     steps = length.astype(init_logit.dtype)
     return (init_logit + steps * step_logits.mean(axis=-1)) / (1.0 + steps)
+
+
+def pool_probabilities(init_logit: Float[Array, "*batch"], step_logits: Float[Array, "*batch k"]) -> Float[Array, "*batch"]:
+    """Logit of an average of probabilities, half of it the initial observation's, half that of the transitions."""
+    probability = 0.5 * (jax.nn.sigmoid(init_logit) + jax.nn.sigmoid(step_logits).mean(axis=-1))
+    return jax.scipy.special.logit(jnp.clip(probability, 1e-6, 1.0 - 1e-6))
