@@ -139,9 +139,9 @@ class Config:
       model_updates_per_step: updates of discriminator, values and generator per environment step (paper: 1).
       model_batch_size: rollouts per source in such an update (paper: 128).
       rollout_steps: transitions of each rollout that the discriminator sees in one update.
-      judge_parts: whether the discriminator judges the parts of a rollout one by one, as PatchGAN does those of a picture: the
-        initial observation and each transition are classified by themselves, and a rollout's score averages their probabilities,
-        the initial observation counting half.  Otherwise it judges rollouts, by the average of their parts' logits (paper).
+      judge_parts: whether the discriminator classifies the parts of a rollout one by one, as PatchGAN does those of a picture:
+        the initial observation and each transition by themselves; a rollout's score averages their probabilities, of which the
+        initial observation's counts half.  Otherwise it classifies rollouts, by the average of their parts' logits (paper).
       recent_steps: discriminator and values learn from the latest so many steps of each source (paper: 10,000).
       relative_progress: whether V1 learns from logits centred and scaled to unit spread over the batch, so that progress weighs
         the same against return however sure the discriminator is (paper: no).

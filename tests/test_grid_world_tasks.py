@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,8 @@ import envs
 from envs.grid_world.layout import format_layout, parse_layout
 from envs.grid_world.solver import solution_length, solve
 from tests.boards import EMPTY, GOAL, LAVA, PLACE, SPACE, WALL, assert_step, layout, load_all, params, play
+
+LAYOUTS = Path(__file__).parents[1] / "experiments" / "layouts"
 
 
 class TestTargets:
@@ -31,6 +34,14 @@ class TestTargets:
     def test_a_takes_one_key_and_b_and_c_take_both(self):
         keys = {name: play(task, solve(task))[-1].state.keys.tolist() for name, task in load_all().items()}
         assert keys == {"A": [True, False], "B": [True, True], "C": [True, True]}
+
+    @pytest.mark.parametrize(("name", "steps", "keys"), [("three_rooms", 19, [True, True]), ("lava_garden", 26, [False, True])])
+    def test_the_example_layouts_can_be_solved(self, name, steps, keys):
+        task = parse_layout((LAYOUTS / f"{name}.txt").read_text())
+        outs = play(task, solve(task))
+        assert len(outs) == steps
+        assert outs[-1].success
+        assert outs[-1].state.keys.tolist() == keys
 
     @pytest.mark.parametrize("name", "ABC")
     def test_format_reads_back(self, name):
