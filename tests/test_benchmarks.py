@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from apt_jax.config import Config, HParams
-from experiments.benchmarks import _flops, _measure, environments, training_step
+from experiments.benchmarks import _flops, _measure, environments, training_step, training_throughput
 from experiments.benchmarks._grid_worlds import JaxWorld, restart
 from tests.corridor import Corridor
 
@@ -155,3 +155,11 @@ def test_a_script_writes_its_numbers_and_what_they_need_to_be_read(tmp_path):
 def test_a_wrong_number_of_cores_is_a_usage_error():
     with pytest.raises(_measure.UsageError, match="--cores"):
         _measure.pin(0)
+
+
+def test_throughputs_are_compared_with_ours():
+    ours = training_throughput.Throughput(_measure.Timing((0.01, 0.02, 0.05), 3.0), _measure.Timing((0.01,), 4.0))
+    theirs = training_throughput.Throughput(_measure.Timing((0.1,), 0.5), _measure.Timing((0.05,), 0.5))
+    text = training_throughput.table({"ours": ours, "theirs": theirs}, training_throughput.Args(cores=2))
+    assert "| ours | 50 (20 to 100) | 1 | 100 (100 to 100) | 1 | 3.0 |" in text
+    assert "| theirs | 10 (10 to 10) | 5 | 20 (20 to 20) | 5 | 0.5 |" in text

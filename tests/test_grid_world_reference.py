@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from envs.grid_world import Space
-from tests.reference.grid_world import ReferenceWorld
+from experiments.benchmarks._python_grid_world import PythonGridWorld
 
 TASKS, STEPS = 2000, 50
 
@@ -65,7 +65,7 @@ def test_every_step_agrees(trajectories):
     params, actions, first_obs, outs = trajectories
     events: Counter[str] = Counter()
     for index in range(TASKS):
-        world = ReferenceWorld(params["tiles"][index].tolist(), params["xy"][index].tolist())
+        world = PythonGridWorld(params["tiles"][index].tolist(), params["xy"][index].tolist())
         assert_same_obs(world.observation(), {name: value[index] for name, value in first_obs.items()})
         for t in range(STEPS):
             event, reward, terminated, truncated = world.step(int(actions[t, index]))

@@ -111,8 +111,11 @@ def check(options: Options) -> None:
         raise UsageError(f"--repeats must be at least 1, got {options.repeats}")
 
 
-def pin(cores: int) -> None:
+def pin(cores: int, *, first: int = 0) -> None:
     """Keeps this process and the threads it will start on `cores` cores; call before JAX starts its backend.
+
+    Args:
+      first: cores that are left to others before these.
 
     Raises:
       UsageError: there are fewer, or the system cannot pin.
@@ -120,9 +123,9 @@ def pin(cores: int) -> None:
     if not hasattr(os, "sched_setaffinity"):
         raise UsageError("pinning to cores needs Linux")
     allowed = sorted(os.sched_getaffinity(0))
-    if not 1 <= cores <= len(allowed):
+    if not 1 <= cores <= len(allowed) - first:
         raise UsageError(f"--cores must be between 1 and the {len(allowed)} this process may use, got {cores}")
-    os.sched_setaffinity(0, allowed[:cores])
+    os.sched_setaffinity(0, allowed[first : first + cores])
 
 
 def time_loop(step: Callable[[C, F], C], carry: C, fixed: F, *, repeats: int, at_least: float) -> Timing:

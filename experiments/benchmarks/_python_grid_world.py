@@ -1,19 +1,24 @@
 """Grid-World once more, in plain Python and straight from its description: the yardstick for the JAX version.
 
-Deliberately shares no code, no data layout and no names of constants with `envs.grid_world`.
+Deliberately shares no code, no data layout and no names of constants with `envs.grid_world`.  Tests take its word for the
+rules, and the PyTorch fixture (`_torch_apt_gen`) trains on it, as on any environment written in Python.
 """
 
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
+
+Place: TypeAlias = tuple[int, int]
+"""Row and column on the 10 x 10 board."""
 
 
-class ReferenceWorld:
+class PythonGridWorld:
     """One task and its running episode: a dict from (row, column) to a word, and one from a thing's name to its place."""
 
-    def __init__(self, scores, xy):
+    def __init__(self, scores: list[list[list[float]]], xy: list[float]) -> None:
         """`scores` is an 8 x 8 x 3 nested list of tile scores, `xy` a list of 10 numbers in [0, 10]."""
-        self.board = {}
+        self.board: dict[Place, str] = {}
         for row in range(10):
             for column in range(10):
                 if row in (0, 9) or column in (0, 9):
@@ -23,9 +28,10 @@ class ReferenceWorld:
                     self.board[row, column] = ["empty", "wall", "lava"][three.index(max(three))]
         self.board[1, 1] = "empty"
 
-        self.things = {}
+        self.things: dict[str, Place] = {}
         for number, name in enumerate(["goal", "yellow door", "blue door", "yellow key", "blue key"]):
-            place = tuple(min(9, max(0, math.floor(xy[2 * number + axis]))) for axis in (0, 1))
+            down, right = (min(9, max(0, math.floor(xy[2 * number + axis]))) for axis in (0, 1))
+            place = (down, right)
             if 0 in place or 9 in place or place in self.things.values():
                 continue
             if place == (1, 1) and name != "goal":
@@ -34,12 +40,14 @@ class ReferenceWorld:
             self.board[place] = "empty"
         self.begin()
 
-    def begin(self):
-        self.agent = (1, 1)
+    def begin(self) -> None:
+        """Starts a new episode of the same task."""
+        self.agent: Place = (1, 1)
         self.left = dict(self.things)
         self.age = 0
 
-    def observation(self):
+    def observation(self) -> dict[str, list[int] | list[list[int]]]:
+        """What the agent sees: its place, a 7 x 7 view of codes around it, and where the things are from it."""
         row, column = self.agent
         code = {"empty": 0, "wall": 1, "lava": 2}
         view = []
@@ -51,13 +59,13 @@ class ReferenceWorld:
             objects += [place[0] - row, place[1] - column]
         return {"agent": [row, column], "view": view, "objects": objects}
 
-    def step(self, action):
+    def step(self, action: int) -> tuple[str, float, bool, bool]:
         """Returns (event, reward, terminated, truncated); `event` names what happened."""
         self.age += 1
         event, reward, terminated = self._act(action)
         return event, reward, terminated, not terminated and self.age == 50
 
-    def _act(self, action):
+    def _act(self, action: int) -> tuple[str, float, bool]:
         if self.left.get("goal") == self.agent:
             return "started on goal", -1.0, True
         row, column = self.agent
