@@ -20,7 +20,7 @@ class HParams:
       value_learning_rate: Adam step size of both value networks, >= 0 (paper: 3e-4).
       generator_learning_rate: Adam step size of the generator, >= 0 (paper: 3e-4).
       gamma: discount of the Q-learning target, in [0, 1].
-      target_rate: Polyak rate of the target network per policy update, in [0, 1].
+      target_rate: Polyak rate of the target network per policy update, in [0, 1] (the paper names none).
       epsilon_start: exploration right after warm-up, in [0, 1].
       epsilon_end: exploration in the long run, in [0, 1].
       epsilon_steps: environment steps over which epsilon falls linearly, > 0.
@@ -205,6 +205,7 @@ PRESETS: dict[str, tuple[Config, HParams]] = {
             model_updates_per_step=0.2,
             model_batch_size=64,
             rollout_steps=2,
+            judge_parts=True,
             recent_steps=20_000,
             relative_progress=True,
             blank_bias=2.0,
@@ -212,6 +213,7 @@ PRESETS: dict[str, tuple[Config, HParams]] = {
         ),
         HParams(
             learning_rate=1e-3,
+            target_rate=0.02,
             generator_learning_rate=7e-4,
             value_weight_decay=10.0,
             cell_noise=0.03,
