@@ -83,6 +83,14 @@ def test_options_override_the_preset(tmp_path):
     assert experiment.hparams == hparams.replace(delta=0.3)
 
 
+def test_a_space_may_have_a_discount_of_its_own(tmp_path):
+    words = ["--run-dir", str(tmp_path), "--preset", "fast", "--space", "manipulation"]
+    experiment, _ = settings.parse(words)
+    assert experiment.hparams == PRESETS["fast"][1].replace(gamma=settings.GAMMA["manipulation"])
+    experiment, _ = settings.parse([*words, "--hparams.gamma", "0.9"])
+    assert experiment.hparams.gamma == 0.9
+
+
 def test_several_values_are_a_sweep_over_every_seed(tmp_path):
     deltas = ["-0.1", "0.1", "0.3", "0.5", "0.7", "0.9", "1.1"]
     experiment = start_run(tmp_path, "--seeds", "0", "1", "2", "3", "4", "--hparams.delta", *deltas, "--hparams.gamma", "0.9")
