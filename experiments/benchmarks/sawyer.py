@@ -95,7 +95,7 @@ def measure(pushes: int) -> dict[str, Agreement]:
     tracking = max(one.tracking for one in played)
     return {
         "MuJoCo, true shapes": _agreement(tool, events, places, seconds, tracking),
-        "MJX": _agreement(tool, _events(inside), inside.position, inside_seconds, None),
+        "MJX": _agreement(tool, _events(inside), np.asarray(inside.position), inside_seconds, None),
     }
 
 
