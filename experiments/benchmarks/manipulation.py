@@ -10,7 +10,7 @@ import dataclasses
 import math
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ class Args(Options):
     """Time pushes, alone and side by side.
 
     Attributes:
-      space: `manipulation`, or `manipulation_sawyer` for pushes by the arm.
+      space: the one with the arm takes it in MJX; in MuJoCo the tool pushes by itself.
       envs: numbers of environments side by side.
       cores: cores that the process may use.
       at_least: seconds that one measurement takes at least.
@@ -43,7 +43,7 @@ class Args(Options):
     """
 
     repeats: int = 3
-    space: str = "manipulation"
+    space: Literal["manipulation", "manipulation_sawyer"] = "manipulation"
     envs: tuple[int, ...] = (1, 16, 64, 256)
     cores: int = 1
     at_least: float = 2.0
