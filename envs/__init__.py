@@ -6,6 +6,7 @@ A new space is a package with a class that fulfils `BenchmarkSpace`, and one ent
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -38,6 +39,7 @@ class BenchmarkSpace(TaskSpace, Protocol):
 SPACES: Mapping[str, Callable[[], BenchmarkSpace]] = {
     "grid_world": grid_world.Space,
     "manipulation": manipulation.Space,
+    "manipulation_sawyer": partial(manipulation.Space, arm="sawyer"),
 }
 """Constructor of each task space by name."""
 

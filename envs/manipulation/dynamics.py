@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Float32, Int, Int32
 
 from apt_jax.task_space import StepOutput
 from envs.manipulation.observation import observe
-from envs.manipulation.push import STROKE, push
+from envs.manipulation.push import STROKE, Arm, push, tool
 from envs.manipulation.table import DIRECTIONS, TARGET, Task
 
 HORIZON = 15
@@ -37,14 +37,14 @@ class State(NamedTuple):
     steps: Int32[Array, ""]
 
 
-def step(state: State, action: Int[Array, ""], task: Task) -> StepOutput:
-    """One push; `action` in [0, 12) is the can times four plus the direction.
+def step(state: State, action: Int[Array, ""], task: Task, arm: Arm = tool) -> StepOutput:
+    """One push by an arm; `action` in [0, 12) is the can times four plus the direction.
 
     The target in the goal when a push is over is success, whichever can was pushed.  A push during which a can falls or meets
     something ends the episode and pays the penalty alone.
     """
     can, direction = action // len(DIRECTIONS), action % len(DIRECTIONS)
-    outcome = push(task, state.cans, task.present, can=can, direction=direction)
+    outcome = push(task, state.cans, task.present, can=can, direction=direction, arm=arm)
     cans = state.cans.at[can].set(outcome.position)
     before, after = (jnp.sqrt(jnp.sum((places[TARGET] - state.goal) ** 2)) for places in (state.cans, cans))
 

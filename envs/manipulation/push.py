@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 
-from envs.manipulation.scene import FOOT_RADIUS, TIMESTEP, TOOL_HALF, push_model
+from envs.manipulation.scene import FOOT_RADIUS, TIMESTEP, TOOL_HALF, Model, push_model
 from envs.manipulation.table import CAN_RADIUS, CANS, DIRECTIONS, FAR, Task, distances, on_ground
 
 STROKE = 0.10
@@ -55,19 +56,53 @@ class Outcome(NamedTuple):
 class Motion(NamedTuple):
     """The simulation's state: MuJoCo's generalised positions, velocities and accelerations, time steps, and events so far.
 
-    The first seven positions are the can's (x, y, z) and quaternion, the last is the tool's.
+    The first seven positions are the can's (x, y, z) and quaternion, the others those of the joints of what holds the tool.
     """
 
-    qpos: Float[Array, "8"]
-    qvel: Float[Array, "7"]
-    qacc: Float[Array, "7"]
+    qpos: Float[Array, "nq"]
+    qvel: Float[Array, "nq-1"]
+    qacc: Float[Array, "nq-1"]
     steps: Int[Array, ""]
     fell: Bool[Array, ""]
     hit: Bool[Array, ""]
 
 
+Supported = Callable[[Float[Array, "feet 3"]], Bool[Array, "feet"]]
+"""Says which of the can's feet, given by their centres in the frame of the push, have ground under them."""
+
+
+class Drive(NamedTuple):
+    """What carries out one push.
+
+    Attributes:
+      start: the can upright at the origin of the push's frame, the tool behind it.
+      side: -1 if that frame's y axis points to the right of the push on the table, 1 if to the left.
+      advance: `advance(motion, supported)`: one time step.
+    """
+
+    start: Motion
+    side: int
+    advance: Callable[[Motion, Supported], Motion]
+
+
+Arm = Callable[[Float[Array, "2"], Float[Array, "2"]], Drive]
+"""`arm(place, ahead)`: how it pushes a can at a place on the table, in metres, in a direction, a unit vector along x or y."""
+
+
+def tool(place: Float[Array, "2"], ahead: Float[Array, "2"]) -> Drive:
+    """No arm: the tool slides along its stroke by itself, everywhere alike."""
+    del place, ahead
+    return Drive(at_rest(), 1, simulate)
+
+
 def push(
-    task: Task, cans: Float[Array, "3 2"], present: Bool[Array, "3"], *, can: Int[Array, ""], direction: Int[Array, ""]
+    task: Task,
+    cans: Float[Array, "3 2"],
+    present: Bool[Array, "3"],
+    *,
+    can: Int[Array, ""],
+    direction: Int[Array, ""],
+    arm: Arm = tool,
 ) -> Outcome:
     """Pushes one can while the others stand still.
 
@@ -76,9 +111,10 @@ def push(
     start = cans[can]
     ahead = jnp.asarray(DIRECTIONS)[direction]
     others = present & (jnp.arange(CANS) != can)
+    drive = arm(start, ahead)
 
     def to_table(points: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
-        turned = jnp.stack([-ahead[1], ahead[0]])
+        turned = drive.side * jnp.stack([-ahead[1], ahead[0]])
         return start[None] + points[:, :1] * ahead[None] + points[:, 1:] * turned[None]
 
     def clearance(point: Float[Array, "2"]) -> Float[Array, ""]:
@@ -95,36 +131,47 @@ def push(
         return possible & ~over & ~((motion.steps > round(STROKE_SECONDS / TIMESTEP)) & slow)
 
     def advance(motion: Motion) -> Motion:
-        moved = simulate(motion, supported)
+        moved = drive.advance(motion, supported)
         x, y, z = moved.qpos[:3]
         fell = (z < -SUNK) | (tilt_cosine(moved.qpos) < FALL_COSINE)
         hit = clearance(to_table(jnp.stack([x, y])[None])[0]) < CAN_RADIUS
         return moved._replace(fell=fell, hit=hit & ~fell)
 
-    tool = to_table(jnp.array([[TOOL_START, 0.0]]))[0]
-    possible = present[can] & (clearance(tool) > TOOL_RADIUS)
-    end = jax.lax.while_loop(going, advance, at_rest())
+    behind = to_table(jnp.array([[TOOL_START, 0.0]]))[0]
+    possible = present[can] & (clearance(behind) > TOOL_RADIUS)
+    end = jax.lax.while_loop(going, advance, drive.start)
     position = to_table(end.qpos[None, :2])[0]
     return Outcome(jnp.where(possible, position, start), end.fell, end.hit)
 
 
-def at_rest() -> Motion:
-    """The can upright at the origin, the tool behind it."""
-    qpos = np.array([0, 0, 0, 1, 0, 0, 0, TOOL_START], np.float32)
-    zeros, no = jnp.zeros(7), jnp.zeros((), bool)
-    return Motion(jnp.asarray(qpos), zeros, zeros, jnp.int32(0), no, no)
+def at_rest(joints: ArrayLike = (TOOL_START,)) -> Motion:
+    """The can upright at the origin, and what holds the tool; by default no arm, and the tool behind the can."""
+    upright = np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
+    qpos = jnp.concatenate([jnp.asarray(upright), jnp.asarray(joints, jnp.float32)])
+    zeros, no = jnp.zeros(len(qpos) - 1), jnp.zeros((), bool)
+    return Motion(qpos, zeros, zeros, jnp.int32(0), no, no)
 
 
-def simulate(motion: Motion, supported: Callable[[Float[Array, "feet 3"]], Bool[Array, "feet"]]) -> Motion:
-    """One time step of MJX with the tool where it has to be; `supported` says which feet have ground under them."""
-    scene = push_model()
-    model, data = jax.tree.map(jnp.asarray, (scene.model, scene.data))
+def simulate(motion: Motion, supported: Supported) -> Motion:
+    """One time step of MJX with the tool where it has to be."""
     place, speed = stroke(motion.steps.astype(jnp.float32) * TIMESTEP)
-    qpos, qvel = motion.qpos.at[7].set(TOOL_START + place), motion.qvel.at[6].set(speed)
-    feet = qpos[None, :3] + jnp.asarray(scene.feet, jnp.float32) @ rotation(qpos[3:7]).T
+    held = motion._replace(qpos=motion.qpos.at[7].set(TOOL_START + place), qvel=motion.qvel.at[6].set(speed))
+    return take_step(push_model(), held, supported)
+
+
+def take_step(scene: Model, motion: Motion, supported: Supported) -> Motion:
+    """One time step of a scene in MJX.
+
+    Args:
+      scene: whose first contact pairs are those of the feet.
+      motion: at the step's start.
+    """
+    model, data = jax.tree.map(jnp.asarray, (scene.model, scene.data))
+    feet = motion.qpos[None, :3] + jnp.asarray(scene.feet, jnp.float32) @ rotation(motion.qpos[3:7]).T
     margin = jnp.concatenate([jnp.where(supported(feet), 0.0, -FAR), jnp.zeros(scene.pairs - len(scene.feet))])
+    data = data.replace(qpos=motion.qpos, qvel=motion.qvel, qacc_warmstart=motion.qacc)
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # MJX mixes both
-        after = scene.step(model.replace(pair_margin=margin), data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=motion.qacc))
+        after = scene.step(model.replace(pair_margin=margin), data)
     return motion._replace(qpos=after.qpos, qvel=after.qvel, qacc=after.qacc, steps=motion.steps + 1)
 
 
@@ -135,7 +182,7 @@ def stroke(time: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     return half * (1 - jnp.cos(phase)), half * jnp.pi / STROKE_SECONDS * jnp.sin(phase)
 
 
-def tilt_cosine(qpos: Float[Array, "8"]) -> Float[Array, ""]:
+def tilt_cosine(qpos: Float[Array, "nq"]) -> Float[Array, ""]:
     """Cosine of the angle between the can's axis and the vertical."""
     return 1 - 2 * (qpos[4] ** 2 + qpos[5] ** 2)
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -47,7 +47,7 @@ class Model(NamedTuple):
     """The scene of a push, as MJX has it; leaves are numpy arrays.
 
     Attributes:
-      step: `step(model, data) -> data`, MJX's, jitted.
+      step: `step(model, data) -> data`, jitted: one time step.
       model: the `mjx.Model`.
       data: an `mjx.Data` to replace fields of.
       feet: the spheres' centres relative to that of the can's base, in the order of their contact pairs.
@@ -91,7 +91,7 @@ def tool(**attributes: str) -> str:
     </body>"""
 
 
-def push_xml() -> str:
+def push_xml(*, with_tool: bool = True) -> str:
     """MJCF of the scene.  The can's side meets nothing but the tool, so it may reach beyond top and bottom."""
     silent = {"contype": "0", "conaffinity": "0"}
     off = " ".join(f'{name}="{value}"' for name, value in silent.items())
@@ -100,6 +100,7 @@ def push_xml() -> str:
         for i, place in enumerate(feet())
     ]
     pairs = [f'<pair geom1="floor" geom2="foot{i}" condim="1" solref="{CONTACT}"/>' for i in range(len(spheres))]
+    pairs += [f'<pair geom1="tool" geom2="side" condim="1" solref="{CONTACT}"/>'] if with_tool else []
     sliding = f'type="slide" frictionloss="{FRICTION * MASS * GRAVITY}" solreffriction="{CONTACT}"'
     return f"""
 <mujoco model="push">
@@ -117,29 +118,35 @@ def push_xml() -> str:
       <geom name="side" type="capsule" size="{CAN_RADIUS} {CAN_HEIGHT / 2}" pos="0 0 {CAN_HEIGHT / 2}" {off}/>
       {"".join(spheres)}
     </body>
-    {tool(**silent)}
+    {tool(**silent) if with_tool else ""}
   </worldbody>
-  <contact>
-    {"".join(pairs)}
-    <pair geom1="tool" geom2="side" condim="1" solref="{CONTACT}"/>
-  </contact>
+  <contact>{"".join(pairs)}</contact>
 </mujoco>"""
 
 
 @functools.cache
 def push_model() -> Model:
-    """The scene for MJX; made once, at first use, because importing MJX takes seconds and prints."""
+    """The scene for MJX; made once, at first use."""
     import mujoco
 
+    return for_mjx(mujoco.MjModel.from_xml_string(push_xml()), lambda mjx: mjx.step)
+
+
+def for_mjx(model: Any, step: Callable[[Any], Callable[..., Any]]) -> Model:
+    """A scene made for MJX; not at import, because importing MJX takes seconds and prints.
+
+    Args:
+      model: the `MjModel`.
+      step: takes the module `mjx` to what is to become `Model.step`.
+    """
     with contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
 
-    model = mujoco.MjModel.from_xml_string(push_xml())
     with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         put = mjx.put_model(model, impl="jax")
         put, data = jax.tree.map(np.asarray, (put, mjx.make_data(put)))
     # Jitted, because tracing it takes seconds: so it is traced once, however many programs push cans.
-    return Model(jax.jit(mjx.step), put, data, feet(), model.npair)
+    return Model(jax.jit(step(mjx)), put, data, feet(), model.npair)
 
 
 def _numbers(values: Iterable[float]) -> str:

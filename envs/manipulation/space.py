@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, Key, UInt8
 
 from apt_jax.specs import Obs, Params, Spec, Vector, param_struct
 from apt_jax.task_space import StepOutput
-from envs.manipulation import dynamics
+from envs.manipulation import arms, dynamics
 from envs.manipulation.dynamics import HORIZON, State
 from envs.manipulation.layout import parse_table
 from envs.manipulation.observation import OBS_SPEC, observe
@@ -27,6 +27,7 @@ class Space:
     Attributes:
       targets: text of each target task by name, for `parse_target`.
       goal_jitter: metres along x and y within which an episode's goal is drawn about the task's, in all tasks alike.
+      arm: what pushes the cans, a name of `arms.ARMS`; the constructor raises ValueError on a wrong one.
     """
 
     name: str = "manipulation"
@@ -36,8 +37,10 @@ class Space:
     horizon: int = HORIZON
     targets: Mapping[str, str] = TARGETS
 
-    def __init__(self, goal_jitter: float = 0.03):
-        self.goal_jitter = goal_jitter
+    def __init__(self, goal_jitter: float = 0.03, arm: str = "tool"):
+        self.goal_jitter, self.arm = goal_jitter, arm
+        self.name = Space.name if arm == "tool" else f"{Space.name}_{arm}"
+        self._arm = arms.arm(arm)
 
     def sample_uniform(self, key: Key[Array, ""]) -> Params:
         """Scores uniform in [0, 1), so that every category is equally likely, and lengths uniform in their range."""
@@ -59,7 +62,7 @@ class Space:
 
     def step(self, state: State, action: Int[Array, ""], task: Task) -> StepOutput:
         """One push: can `action // 4` in direction `action % 4` (see `DIRECTIONS`); see `dynamics` for the rules."""
-        return dynamics.step(state, action, task)
+        return dynamics.step(state, action, task, self._arm)
 
     def fingerprint(self, state: State) -> Int[Array, "6"]:
         """Where the cans are, in centimetres; of an absent one too, which never moves."""

@@ -10,7 +10,7 @@ import dataclasses
 import math
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,7 @@ class Args(Options):
     """Time pushes, alone and side by side.
 
     Attributes:
+      space: the one with the arm takes it in MJX; in MuJoCo the tool pushes by itself.
       envs: numbers of environments side by side.
       cores: cores that the process may use.
       at_least: seconds that one measurement takes at least.
@@ -42,6 +43,7 @@ class Args(Options):
     """
 
     repeats: int = 3
+    space: Literal["manipulation", "manipulation_sawyer"] = "manipulation"
     envs: tuple[int, ...] = (1, 16, 64, 256)
     cores: int = 1
     at_least: float = 2.0
@@ -70,7 +72,7 @@ def main() -> int:
         args = dataclasses.replace(args, repeats=1, envs=args.envs[:2], at_least=0.0, checked=64, true_pushes=2)
     sides = {n: time_pushes(n, args) for n in args.envs}
     same, true = time_same_model(args), time_true_shapes(args)
-    faults = count_faults(args.checked)
+    faults = count_faults(args.space, args.checked)
     rows = [
         [f"MJX, {n} side by side", _cell(side.timing, n), *_costs(side.timing, n), f"{side.peak_memory / 2**20:.0f}"]
         for n, side in sides.items()
@@ -101,7 +103,7 @@ def random_pushes(key: Key[Array, ""], n: int) -> tuple[Any, Any, Array]:
 
 def time_pushes(n: int, args: Args) -> Side:
     """Environments that start a new random task with every push, so that none is over before the others begin."""
-    step = jax.vmap(envs.make("manipulation").step)
+    step = jax.vmap(envs.make(args.space).step)
 
     def push(carry: tuple[Key[Array, ""], Float[Array, ""]], _: None) -> tuple[Key[Array, ""], Float[Array, ""]]:
         key, key_push = jax.random.split(carry[0])
@@ -166,10 +168,10 @@ def _push_true(model: mujoco.MjModel) -> None:
         mujoco.mj_step(model, data)
 
 
-def count_faults(pushes: int) -> int:
+def count_faults(space: str, pushes: int) -> int:
     """Random pushes after which a place, a reward or a height is not a number."""
     batch = min(pushes, 250)
-    step = jax.vmap(envs.make("manipulation").step)
+    step = jax.vmap(envs.make(space).step)
 
     @jax.jit
     def faults(key: Key[Array, ""]) -> Array:

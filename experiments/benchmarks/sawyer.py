@@ -1,4 +1,7 @@
-"""How well the Sawyer arm's pushes agree with the task space's: `python -m experiments.benchmarks.sawyer`."""
+"""How well a Sawyer arm's pushes agree with those of the tool alone: `python -m experiments.benchmarks.sawyer`.
+
+The arm is simulated twice: in MuJoCo, with the true shapes of everything on the table, and in MJX, as in the task space.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from jaxtyping import Array, Float, Int, Shaped
 
-from envs.manipulation.push import push
+from envs.manipulation.arms import arm
+from envs.manipulation.dynamics import State
+from envs.manipulation.push import Outcome, push
 from envs.manipulation.sawyer.replay import replay
+from envs.manipulation.table import Task
 from experiments.benchmarks import _measure
 from experiments.benchmarks._measure import Options
 from experiments.benchmarks.manipulation import random_pushes
@@ -22,7 +29,7 @@ from experiments.errors import exit_with
 
 @dataclass(frozen=True)
 class Args(Options):
-    """Play random pushes on uniformly random tables with the arm.
+    """Random pushes on uniformly random tables, by the tool alone and by the arm.
 
     Attributes:
       pushes: how many.
@@ -36,18 +43,18 @@ class Agreement:
     """How the pushes of both ended.
 
     Attributes:
-      events: by the task space's event and the arm's, how many pushes.
+      events: by the tool's event and the arm's, how many pushes.
       agree: share of the pushes with the same event.
       distances: metres between the can's places, for each push that both end without an event.
-      tracking: metres that the tip was off its course in any stroke, at most.
       seconds: per push.
+      tracking: metres that the tip was off its course in any stroke, at most; None if not looked at.
     """
 
     events: dict[str, int]
     agree: float
     distances: list[float]
-    tracking: float
     seconds: float
+    tracking: float | None
 
 
 def main() -> int:
@@ -56,41 +63,67 @@ def main() -> int:
     _measure.check(args)
     if args.quick:
         args = dataclasses.replace(args, pushes=2)
-    result = measure(args.pushes)
-    header = ["pushes", "same event", "mean distance, mm", "largest, mm", "tracking, mm", "s per push"]
-    distances = 1000 * np.array(result.distances or [np.nan])
-    values = [100 * result.agree, distances.mean(), distances.max(), 1000 * result.tracking, result.seconds]
-    row = [str(args.pushes), *(_measure.number(float(value)) for value in values)]
-    row[1] += " %"
-    _measure.report("sawyer", args, dataclasses.asdict(result), _measure.table(header, [row]))
+    results = measure(args.pushes)
+    header = ["pushes by the arm", "same event", "mean distance, mm", "largest, mm", "tracking, mm", "s per push"]
+    text = _measure.table(header, [_row(name, result) for name, result in results.items()])
+    _measure.report("sawyer", args, {name: dataclasses.asdict(result) for name, result in results.items()}, text)
     return 0
 
 
-def measure(pushes: int) -> Agreement:
-    """Random pushes of the first can, by the task space and by the arm."""
-    tasks, states, directions = random_pushes(jax.random.key(0), pushes)
+def measure(pushes: int) -> dict[str, Agreement]:
+    """Random pushes of the first can: how those of each arm agree with the tool's."""
+    tasks, states, directions = jax.device_get(random_pushes(jax.random.key(0), pushes))
 
-    @jax.jit
-    @jax.vmap
-    def simulate(task, state, direction):  # type: ignore[no-untyped-def]
-        return push(task, state.cans, task.present, can=jnp.int32(0), direction=direction)
+    def simulate(name: str) -> tuple[Outcome, float]:
+        """What the pushes of an arm in MJX did, and seconds per push."""
 
-    tasks, states, directions, outcome = jax.device_get((tasks, states, directions, simulate(tasks, states, directions)))
-    ours = np.select([outcome.fell, outcome.hit], ["fell", "hit"], "")
+        def one(task: Task, state: State, direction: Int[Array, ""]) -> Outcome:
+            return push(task, state.cans, task.present, can=jnp.int32(0), direction=direction, arm=arm(name))
+
+        run = jax.jit(jax.vmap(one)).lower(tasks, states, directions).compile()
+        began = time.perf_counter()
+        outcome: Outcome = jax.device_get(run(tasks, states, directions))
+        return outcome, (time.perf_counter() - began) / pushes
+
+    tool, _ = simulate("tool")
+    inside, inside_seconds = simulate("sawyer")
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], tasks) for i in range(pushes)]
     began = time.perf_counter()
     played = [replay(each[i], states.goal[i], [directions[i]])[0] for i in range(pushes)]
     seconds = (time.perf_counter() - began) / pushes
-    theirs = np.array([one.event for one in played])
-    away = np.linalg.norm(np.array([one.cans[0] for one in played]) - outcome.position, axis=-1)
-    pairs = collections.Counter(f"{a or 'none'}, {b or 'none'}" for a, b in zip(ours.tolist(), theirs.tolist(), strict=True))
+    events, places = np.array([one.event for one in played]), np.array([one.cans[0] for one in played])
+    tracking = max(one.tracking for one in played)
+    return {
+        "MuJoCo, true shapes": _agreement(tool, events, places, seconds, tracking),
+        "MJX": _agreement(tool, _events(inside), np.asarray(inside.position), inside_seconds, None),
+    }
+
+
+def _events(outcome: Outcome) -> Shaped[np.ndarray, "n"]:
+    return np.select([outcome.fell, outcome.hit], ["fell", "hit"], "")
+
+
+def _agreement(
+    tool: Outcome, events: Shaped[np.ndarray, "n"], places: Float[np.ndarray, "n 2"], seconds: float, tracking: float | None
+) -> Agreement:
+    ours = _events(tool)
+    away = np.linalg.norm(places - tool.position, axis=-1)
+    pairs = collections.Counter(f"{a or 'none'}, {b or 'none'}" for a, b in zip(ours.tolist(), events.tolist(), strict=True))
     return Agreement(
         events=dict(pairs),
-        agree=float((ours == theirs).mean()),
-        distances=away[(ours == "") & (theirs == "")].tolist(),
-        tracking=max(one.tracking for one in played),
+        agree=float((ours == events).mean()),
+        distances=away[(ours == "") & (events == "")].tolist(),
         seconds=seconds,
+        tracking=tracking,
     )
+
+
+def _row(name: str, result: Agreement) -> list[str]:
+    distances = 1000 * np.array(result.distances or [np.nan])
+    away = [_measure.number(float(value)) for value in (distances.mean(), distances.max())]
+    tracking = "" if result.tracking is None else _measure.number(1000 * result.tracking)
+    pushes, same = sum(result.events.values()), f"{_measure.number(100 * result.agree)} %"
+    return [f"{pushes} in {name}", same, *away, tracking, _measure.number(result.seconds)]
 
 
 if __name__ == "__main__":

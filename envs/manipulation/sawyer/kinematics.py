@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -22,13 +23,17 @@ the elbow straight up, the arm would be stretched out before its hand is over th
 SPEEDS = np.array([link.speed for link in LINKS])
 """Radians per second of each joint, at most."""
 
-EASE, MOST_EASE = 0.02, 2e-4 * SPEEDS
-"""Share of the way to `REST` per iteration, and radians at most: a fifth of the speed limits, at 1000 iterations a second."""
+EASE, MOST_EASE = 0.02, 2e-4 * SPEEDS * (np.arange(JOINTS) < JOINTS - 1)
+"""Share of the way to `REST` per iteration, and radians at most: a fifth of the speed limits, at 1000 iterations a second; the
+last joint is not drawn there."""
 
 CLOSE = 1e-6
 """Metres and radians that end the iterations."""
 
 IDENTITY = np.eye(6)
+
+Array = Any
+"""Of numpy or of JAX."""
 
 Joints = Float[np.ndarray, "7"]
 Point = Float[np.ndarray, "3"]
@@ -47,6 +52,20 @@ def limits() -> Float[np.ndarray, "7 2"]:
     return np.array([link.limits for link in LINKS])
 
 
+def closer(joints: Array, error: Array, jacobian: Array) -> Array:
+    """Joint angles [7] one iteration closer to a pose of the tip, in radians, never beyond the joints' limits.
+
+    Args:
+      joints: where they are [7]; arrays are those of numpy or of JAX, whichever is given.
+      error: what is missing to the pose [6]: a translation in metres and a turn as axis times angle.
+      jacobian: of the tip [6, 7], by joint: how it moves and turns.
+    """
+    xp = joints.__array_namespace__()
+    ease = xp.clip(EASE * (REST - joints), -MOST_EASE, MOST_EASE)
+    damped = xp.linalg.solve(jacobian @ jacobian.T + DAMPING**2 * IDENTITY, error - jacobian @ ease)
+    return xp.clip(joints + ease + jacobian.T @ damped, *limits().T)
+
+
 class Kinematics:
     """The arm's geometry at one posture at a time."""
 
@@ -62,7 +81,7 @@ class Kinematics:
         return self.data.site_xpos[self.tip].copy(), self.data.site_xmat[self.tip].reshape(3, 3).copy()
 
     def approach(self, joints: Joints, point: Point, rotation: Rotation, iterations: int = 1) -> Joints:
-        """Joint angles closer to a pose of the tip, never beyond the joints' limits; the last one is not drawn to `REST`."""
+        """Joint angles closer to a pose of the tip, see `closer`."""
         for _ in range(iterations):
             error = np.concatenate(self._error(joints, point, rotation))
             if iterations > 1 and np.abs(error).max() < CLOSE:
@@ -70,10 +89,7 @@ class Kinematics:
             mujoco.mj_comPos(self.model, self.data)
             jacobian = np.empty((6, JOINTS))
             mujoco.mj_jacSite(self.model, self.data, jacobian[:3], jacobian[3:], self.tip)
-            ease = np.clip(EASE * (REST - joints), -MOST_EASE, MOST_EASE)
-            ease[6] = 0.0
-            damped = np.linalg.solve(jacobian @ jacobian.T + DAMPING**2 * IDENTITY, error - jacobian @ ease)
-            joints = np.clip(joints + ease + jacobian.T @ damped, *limits().T)
+            joints = closer(joints, error, jacobian)
         return joints
 
     def _error(self, joints: Joints, point: Point, rotation: Rotation) -> tuple[Point, Point]:

@@ -11,14 +11,11 @@ from jaxtyping import Float
 
 from envs.manipulation.push import GAP, STROKE, STROKE_SECONDS
 from envs.manipulation.sawyer.arm import BASE
-from envs.manipulation.sawyer.kinematics import REST, SPEEDS, Kinematics, Rotation
-from envs.manipulation.scene import TOOL_HALF, TOOL_HEIGHT
-from envs.manipulation.table import CAN_HEIGHT, CAN_RADIUS, Task, distances
+from envs.manipulation.sawyer.kinematics import REST, SPEEDS, Kinematics
+from envs.manipulation.sawyer.pose import behind, lean, rotation
+from envs.manipulation.scene import TOOL_HALF
+from envs.manipulation.table import CAN_HEIGHT, Task, distances
 from envs.manipulation.table_scene import TIMESTEP
-
-LEAN_FROM, LEAN_TO, LEAN = 0.7, 1.0, 0.15
-"""Metres from the robot's axis from which on the tool leans outwards and where it leans most, and by how many radians there:
-the arm is too short to hold it upright everywhere.  Leaning more, the stick would touch a can's top."""
 
 SPARE = 0.03
 """Metres between the tool's tip and what it crosses."""
@@ -40,8 +37,7 @@ HOLD_SECONDS, RETREAT, RETREAT_SECONDS = 0.15, 0.015, 0.15
 """After a stroke the tool waits for the can to come to rest, then leaves it backwards before it rises."""
 
 Pose = Float[np.ndarray, "6"]
-"""x, y and z of the tip, the angle of its normal about the vertical, and its lean: a turn about a horizontal axis, as the x and
-y of axis times angle."""
+"""See `pose`."""
 
 
 class Plan(NamedTuple):
@@ -71,7 +67,7 @@ class Planner:
         self.task = task
         self.kinematics = Kinematics()
         start = np.array([BASE[0], BASE[1] + 0.45])
-        self.pose = _pose(start, self._clear(start, start), 0.0, lean(start))
+        self.pose: Pose = np.array([*start, self._clear(start, start), 0.0, *lean(start)])
         self.joints = self.kinematics.approach(REST, self.pose[:3], rotation(self.pose), iterations=300)
 
     def push(self, place: Float[np.ndarray, "2"], ahead: Float[np.ndarray, "2"]) -> Plan:
@@ -79,11 +75,9 @@ class Planner:
 
         Joints keep to their limits of position, and of speed but for the stroke, whose time is the task space's.
         """
-        heading, leaning = _heading(ahead), lean(place)
-        behind = place - ahead * (CAN_RADIUS + GAP + _extent(heading, leaning, ahead))
-        height = self._clear(self.pose[:2], behind)
-        above = _pose(behind, height, heading, leaning)
-        down = _pose(behind, TOOL_HEIGHT, heading, leaning)
+        down = behind(place, ahead)
+        above = down.copy()
+        above[2] = height = self._clear(self.pose[:2], down[:2])
         done = down + np.pad(ahead * (STROKE + GAP), (0, 4))
         back = done - np.pad(ahead * RETREAT, (0, 4))
         up = self.pose.copy()
@@ -127,44 +121,6 @@ class Planner:
         near = np.asarray(jax.vmap(distances, in_axes=(None, 0))(self.task.obstacles, way)) < WIDTH
         highest = float(np.max(np.where(near, self.task.obstacles.height, 0.0)))
         return max(highest, CAN_HEIGHT) + SPARE + TOOL_HALF[2]
-
-
-def _heading(ahead: Float[np.ndarray, "2"]) -> float:
-    """The angle of a direction along x or y, from -pi / 2 to pi: so the last joint stays far from its limits."""
-    return float(np.arctan2(ahead[1] + 0.0, ahead[0]))  # -0.0 would give -pi
-
-
-def lean(place: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-    """Lean of the tool for a push from `place`: away from the robot, the more the farther."""
-    outwards = place - np.array(BASE)
-    far = float(np.linalg.norm(outwards))
-    angle = LEAN * np.clip((far - LEAN_FROM) / (LEAN_TO - LEAN_FROM), 0, 1)
-    x, y = outwards / far
-    turned: Float[np.ndarray, "2"] = angle * np.array([y, -x])
-    return turned
-
-
-def rotation(pose: Pose) -> Rotation:
-    """From the tip's axes to the world's: z down along the stick, x its normal, both turned by the lean."""
-    cosine, sine = np.cos(pose[3]), np.sin(pose[3])
-    upright = np.array([[cosine, sine, 0], [sine, -cosine, 0], [0, 0, -1]])
-    angle = float(np.hypot(pose[4], pose[5]))
-    if angle == 0:
-        return upright
-    x, y = pose[4:] / angle
-    cross = np.array([[0, 0, y], [0, 0, -x], [-y, x, 0]])
-    turn: Rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    return turn @ upright
-
-
-def _pose(place: Float[np.ndarray, "2"], height: float, heading: float, leaning: Float[np.ndarray, "2"]) -> Pose:
-    return np.array([*place, height, heading, *leaning])
-
-
-def _extent(heading: float, leaning: Float[np.ndarray, "2"], ahead: Float[np.ndarray, "2"]) -> float:
-    """How far the tip reaches beyond its centre."""
-    turned = rotation(_pose(ahead, 0.0, heading, leaning))
-    return float(np.abs(np.array([*ahead, 0]) @ turned) @ np.array(TOOL_HALF))
 
 
 def _progress(seconds: float) -> Float[np.ndarray, "n"]:

@@ -14,11 +14,12 @@ from envs.manipulation.dynamics import GOAL_RADIUS
 from envs.manipulation.push import FALL_COSINE, SUNK, TOOL_RADIUS, TOOL_START
 from envs.manipulation.sawyer.kinematics import JOINTS, Joints
 from envs.manipulation.sawyer.motion import Plan, Planner
+from envs.manipulation.sawyer.servo import wanted
 from envs.manipulation.sawyer.stage import PREFIX, mirror, mirror_places, stage
 from envs.manipulation.table import ABSENT, CAN_HEIGHT, CAN_RADIUS, CANS, DIRECTIONS, TARGET, Task, distances
 
-STIFFNESS, RESISTANCE = 9e4, 600.0
-"""Acceleration of a joint per radian it is off (1/s^2) and per radian per second (1/s): critically damped, 3 ms."""
+RATE = 300.0
+"""How fast the joints come back to their course (1/s, see `servo`).  Hence an acceleration of 9e4 1/s^2 per radian."""
 
 REST, REST_SECONDS = 1e-3, 2.0
 """Speed (m/s and rad/s) below which nothing moves any more, and how long to wait for that."""
@@ -135,10 +136,9 @@ class Scene:
         """One time step: the torque that gives the joints the wanted accelerations, and takes back what they are off."""
         model, data = self.model, self.data
         mujoco.mj_step1(model, data)
-        off = joints - data.qpos[self.positions]
-        wanted = accelerations + RESISTANCE * (speeds - data.qvel[self.dofs]) + STIFFNESS * off
+        off, speed_off = joints - data.qpos[self.positions], speeds - data.qvel[self.dofs]
         motion, torque = np.zeros(model.nv), np.empty(model.nv)
-        motion[self.dofs] = wanted
+        motion[self.dofs] = wanted(off, speed_off, accelerations, RATE)
         mujoco.mj_mulM(model, data, torque, motion)
         data.ctrl[self.motors] = (torque + data.qfrc_bias)[self.dofs]
         mujoco.mj_step2(model, data)

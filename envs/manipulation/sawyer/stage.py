@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.typing import ArrayLike
 
 from envs.manipulation.dynamics import GOAL_RADIUS
 from envs.manipulation.render import CAN_COLORS, GOAL_COLOR, LOW, SURFACE
@@ -28,28 +29,28 @@ STRIP = 0.004
 PREFIX = "sawyer/"
 """Before the names of all that is the robot's."""
 
+Array = Any
+"""Of numpy or of JAX."""
+
 PICTURE = (480, 360)
 """Pixels of a picture."""
 
 
 def mirror(task: Task) -> Task:
     """The task as the robot sees it: x runs the other way."""
-    obstacles, cans = task.obstacles, np.asarray(task.cans)
-    axis = np.asarray(obstacles.axis) * np.array([-1, 1], np.float32)
+    obstacles = task.obstacles
+    seen = obstacles._replace(center=mirror_places(obstacles.center), axis=obstacles.axis * np.array([[-1, 1]], np.float32))
     return task._replace(
         ground=jnp.asarray(task.ground)[::-1],
-        obstacles=obstacles._replace(
-            center=jnp.asarray(mirror_places(obstacles.center), jnp.float32), axis=jnp.asarray(axis, jnp.float32)
-        ),
-        cans=jnp.asarray(np.where(np.asarray(task.present)[:, None], mirror_places(cans), cans), jnp.float32),
-        goal=jnp.asarray(mirror_places(task.goal), jnp.float32),
+        obstacles=jax.tree.map(jnp.asarray, seen),
+        cans=jnp.where(jnp.asarray(task.present)[:, None], mirror_places(task.cans), task.cans),
+        goal=jnp.asarray(mirror_places(task.goal)),
     )
 
 
-def mirror_places(places: ArrayLike) -> Float[np.ndarray, "*n 2"]:
-    """(x, y) of a task as the robot sees them, and the other way round."""
-    turned: Float[np.ndarray, "*n 2"] = np.asarray(places, float) * (-1, 1) + (SIZE[0], 0)
-    return turned
+def mirror_places(places: Array) -> Array:
+    """(x, y) of a task [..., 2] as the robot sees them, and the other way round; of numpy or of JAX, whichever is given."""
+    return places.__array_namespace__().stack([SIZE[0] - places[..., 0], places[..., 1]], axis=-1)
 
 
 def stage(task: Task, goal: Float[np.ndarray, "2"]) -> mujoco.MjModel:
