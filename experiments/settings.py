@@ -22,7 +22,7 @@ Preset = Literal["paper", "fast"]
 
 SinkName = Literal["tensorboard", "wandb"]
 
-GAMMA: Mapping[str, float] = {"manipulation": 0.85}
+GAMMA: Mapping[str, float] = {"manipulation": 0.85, "manipulation_sawyer": 0.85}
 """Spaces with a discount of their own, whatever the preset.
 
 None of Manipulation's 15 pushes costs anything: at 0.99 the way and a detour differ by less than a network can tell.
