@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from apt_jax.config import Config, HParams
-from experiments.benchmarks import _flops, _measure, environments, training_step, training_throughput
+from experiments.benchmarks import _flops, _measure, dqn_peers, environments, training_step, training_throughput
 from experiments.benchmarks._grid_worlds import JaxWorld, restart
 from tests.corridor import Corridor
 
@@ -37,10 +37,17 @@ CONFIG = Config(
 )
 
 
+def one_second_each(*shape_and_args):
+    """Instead of timing matmuls, each shape a compilation: a product takes a second."""
+    return training_step.Matmul(*shape_and_args[:3], _measure.Timing((2.0,), 0.0), 1)
+
+
 @pytest.fixture(scope="module")
 def result():
     problem = _measure.Problem(Corridor(), np.int32(7), CONFIG, HParams())
-    return training_step.measure(problem, training_step.Args(repeats=2, at_least=0.0), rate=1e9)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training_step, "time_matmul", one_second_each)
+        return training_step.measure(problem, training_step.Args(repeats=2, at_least=0.0))
 
 
 def test_every_part_of_a_training_step_is_timed(result):
@@ -69,11 +76,27 @@ def test_results_of_a_training_step_are_json_and_a_table(result):
         "shortest_chunk",
         "model_update",
         "models",
-        "policy_update",
+        "work",
     }
-    text = training_step.tables("tiny", result)
+    text = training_step.tables("tiny", result, rate=1e9)
     assert "| sum of the parts |" in text
     assert "Whole / sum of the parts:" in text
+
+
+def test_the_work_of_a_training_step_is_counted(result):
+    policy, *models, jointly, step = result.work.values()
+    assert all(one.flops >= one.matmul_flops > 0 for one in result.work.values())
+    assert jointly.matmul_flops == sum(one.matmul_flops for one in models)
+    assert jointly.matmul_seconds == sum(one.matmul_seconds for one in models) > 10  # products
+    assert step.matmul_flops == CONFIG.updates_per_step * policy.matmul_flops + 0.5 * jointly.matmul_flops
+    text = training_step.work_table("one", {"half of it": training_step.Work(3e6, 2e6, 0.001, 0.004)}, rate=1e9)
+    assert "| half of it | 3 | 2 | 0.5 | 25.0% | 50.0% |" in text
+
+
+def test_a_matmul_is_timed_there_and_back():
+    matmul = training_step.time_matmul(2, 3, 4, training_step.Args(repeats=2, at_least=0.0))
+    assert matmul.flops == 2 * (2 * 2 * 3 * 4)
+    assert matmul.rate > 0
 
 
 def test_matmul_flops_count_the_runs_of_a_loop():
@@ -163,3 +186,17 @@ def test_throughputs_are_compared_with_ours():
     text = training_throughput.table({"ours": ours, "theirs": theirs}, training_throughput.Args(cores=2))
     assert "| ours | 50 (20 to 100) | 1 | 100 (100 to 100) | 1 | 3.0 |" in text
     assert "| theirs | 10 (10 to 10) | 5 | 20 (20 to 20) | 5 | 0.5 |" in text
+
+
+def test_q_learning_is_compared_with_ours():
+    results = {"ours": _measure.Timing((0.01, 0.02, 0.05), 3.0), "theirs": _measure.Timing((0.1,), 0.0)}
+    text = dqn_peers.table(results, updates=2)
+    assert "| ours | 50 (20 to 100) | 1 | 3.0 |" in text
+    assert "| theirs | 10 (10 to 10) | 5 | 0.0 |" in text
+
+
+def test_q_learning_without_peers_says_what_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["dqn_peers"])
+    monkeypatch.setattr(dqn_peers.importlib.util, "find_spec", lambda name: None)
+    assert dqn_peers.main() == 0
+    assert "gymnax, rejax, stable_baselines3 not installed" in capsys.readouterr().out

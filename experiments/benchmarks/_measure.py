@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
@@ -87,6 +88,11 @@ class Timing:
     def cell(self, unit: float = 1e-3) -> str:
         """Median and range in multiples of `unit` seconds, for a table."""
         median, low, high = (number(s / unit) for s in (self.median, min(self.seconds), max(self.seconds)))
+        return f"{median} ({low} to {high})"
+
+    def rate(self, count: float = 1.0) -> str:
+        """Median and range of how many things a second are done, `count` of them in a run, for a table."""
+        median, low, high = (number(count / s) for s in (self.median, max(self.seconds), min(self.seconds)))
         return f"{median} ({low} to {high})"
 
 
@@ -194,6 +200,18 @@ def peak_memory() -> int:
     """Largest resident size of this process so far, in bytes."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def versions(packages: Sequence[str]) -> dict[str, str | None]:
+    """The installed version of each package, None of one that is missing."""
+
+    def version(package: str) -> str | None:
+        try:
+            return metadata.version(package)
+        except metadata.PackageNotFoundError:
+            return None
+
+    return {package: version(package) for package in packages}
 
 
 def number(value: float) -> str:
