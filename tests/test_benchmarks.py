@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 
 from apt_jax.config import Config, HParams
-from experiments.benchmarks import _flops, _measure, dqn_peers, environments, training_step, training_throughput
+from apt_jax.trainer import make_trainer
+from experiments.benchmarks import _flops, _measure, dqn_peers, environments, growth, training_step, training_throughput
 from experiments.benchmarks._grid_worlds import JaxWorld, restart
+from experiments.benchmarks._stretched import Stretched
 from tests.corridor import Corridor
 
 CONFIG = Config(
@@ -200,3 +202,43 @@ def test_q_learning_without_peers_says_what_is_missing(monkeypatch, capsys):
     monkeypatch.setattr(dqn_peers.importlib.util, "find_spec", lambda name: None)
     assert dqn_peers.main() == 0
     assert "gymnax, rejax, stable_baselines3 not installed" in capsys.readouterr().out
+
+
+def test_a_stretched_space_cuts_episodes_where_it_is_told_and_ignores_what_it_adds():
+    space = Stretched(Corridor(), horizon=20, more=3)
+    w = jax.jit(space.sample_uniform)(jax.random.key(0))
+    assert {name: block.shape for name, block in w.items()} == {"goal": (1,), "paint": (4, 4, 2), "more": (3,)}
+    assert space.instantiate({**w, "goal": jnp.array([4.5])}) == 4
+    state, _ = space.reset(jax.random.key(1), jnp.int32(7))
+    step = jax.jit(space.step)
+    for count in range(1, 21):
+        out = step(state, jnp.int32(0), jnp.int32(7))
+        assert out.truncated == (count == 20)
+        state = out.state
+
+
+def test_growth_is_measured_tabulated_and_drawn(tmp_path, monkeypatch):
+    """On the corridor, the usual run once for both axes."""
+    loaded = []
+
+    def load(point, quick):
+        loaded.append(point)
+        config = dataclasses.replace(CONFIG, method="dqn", replay_steps=100 * point.seeds)
+        return _measure.Problem(Stretched(Corridor(), horizon=12, more=0), np.int32(7), config, HParams())
+
+    monkeypatch.setattr(growth, "load_problem", load)
+    args = growth.Args(repeats=2)
+    sizes = {"seeds": (1, 2), "parameter": (growth.PARAMETER,)}
+    costs = {axis: {size: growth.measure(growth.at(axis, size), args) for size in sizes[axis]} for axis in sizes}
+    assert loaded == [growth.Point(), growth.Point(seeds=2)]
+    assert costs["seeds"][2].state > costs["seeds"][1].state > 0
+    assert "| 2 (2) | " in growth.tables(costs)
+    growth.draw(tmp_path / "growth.png", costs)
+    assert (tmp_path / "growth.png").stat().st_size > 0
+
+
+def test_every_size_of_growth_fits_the_preset():
+    for axis, sizes in growth.AXES.items():
+        for size in sizes:
+            problem = growth.load_problem(growth.at(axis, size), quick=True)
+            make_trainer(problem.space, problem.target, problem.config)

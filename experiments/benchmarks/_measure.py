@@ -170,6 +170,14 @@ def time_calls(
     """
     carry = jax.tree.map(jnp.copy, carry)
     compiled, compile_seconds = compile_ahead(jax.jit(function, donate_argnums=0), *carry, fixed)
+    seconds, carry = time_runs(compiled, carry, fixed, repeats=repeats)
+    return Timing(seconds, compile_seconds), carry
+
+
+def time_runs(
+    compiled: Callable[..., tuple[Any, ...]], carry: tuple[Any, ...], fixed: Any, *, repeats: int
+) -> tuple[tuple[float, ...], tuple[Any, ...]]:
+    """The seconds of each run of `(*carry, output) = compiled(*carry, fixed)` but the first, and the carry after all runs."""
 
     def run() -> float:
         nonlocal carry
@@ -180,10 +188,10 @@ def time_calls(
         return time.perf_counter() - began
 
     run()
-    return Timing(tuple(run() for _ in range(repeats)), compile_seconds), carry
+    return tuple(run() for _ in range(repeats)), carry
 
 
-def compile_ahead(function: Callable[..., Any], *args: Any) -> tuple[Callable[..., Any], float]:
+def compile_ahead(function: Callable[..., Any], *args: Any) -> tuple[Any, float]:
     """A jitted function compiled for some arguments, and the seconds that took."""
     began = time.perf_counter()
     compiled = cast(jax.stages.Wrapped, function).lower(*args).compile()
@@ -225,12 +233,17 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
+def result_path(name: str, options: Options) -> Path:
+    """The file that a benchmark's raw numbers go to."""
+    return options.out or Path("runs") / "benchmarks" / f"{name}.json"
+
+
 def report(name: str, options: Options, results: Mapping[str, Any], text: str) -> None:
     """Prints the tables and writes the raw numbers with all that is needed to read them."""
     environment = {**runtime.describe(), "cpu": _cpu_model(), "cores": os.cpu_count(), "load_average": _LOAD_AVERAGE}
     settings = {key: value for key, value in dataclasses.asdict(options).items() if key != "out"}
     content = {"benchmark": name, "settings": settings, "environment": environment, "results": results}
-    path = options.out or Path("runs") / "benchmarks" / f"{name}.json"
+    path = result_path(name, options)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1, default=dataclasses.asdict) + "\n")
     print(f"{text}\n{_caption(environment)}\nRaw numbers: {path}")
