@@ -168,21 +168,24 @@ def table(axis: Axis, costs: Mapping[int, Cost]) -> str:
     (least, first), *_ = costs.items()
 
     def row(size: int, cost: Cost) -> list[str]:
-        seeds = at(axis, size).seeds
+        point = at(axis, size)
+        steps = point.seeds * SOURCES * point.environments
         return [
             f"{size:,} ({_measure.number(size / least)})",
             cost.iteration.cell(),
+            _measure.number(1e3 * cost.iteration.median / steps),
             _measure.number(cost.iteration.median / first.iteration.median),
             _measure.number(cost.state / 2**20),
             _measure.number(cost.besides / 2**20),
             _measure.number((cost.state + cost.besides) / (first.state + first.besides)),
-            _measure.number(cost.state / seeds / 2**20),
+            _measure.number(cost.state / point.seeds / 2**20),
         ]
 
     header = [
         axis,
         "ms per iteration",
-        "times the first",
+        "ms per environment step",
+        "iteration, times the first",
         "state, MiB",
         "besides, MiB",
         "both, times the first",
@@ -208,8 +211,8 @@ def draw(file: Path, growth: Growth) -> None:
             axes.set_yscale("log", base=2)
             axes.set_xlabel(axis)
             axes.set_ylabel(label)
-            for scale in (axes.xaxis, axes.yaxis):
-                scale.set_major_formatter(lambda value, _: f"{value:,.4g}")
+            axes.set_xticks(sizes, [f"{size:,}" for size in sizes], rotation=45, fontsize="x-small")
+            axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.4g}")
             axes.grid(alpha=0.3)
     figure.savefig(file, dpi=150)
 
