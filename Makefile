@@ -15,7 +15,7 @@ STAMP := $(VENV)/.installed
 EXTRAS := experiments,dev
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test lint format bench constraints clean
+.PHONY: help install train test lint format peers bench constraints clean
 
 help: ## Say what each command does.
 	@grep -hE '^[a-z]+:.*## ' $(firstword $(MAKEFILE_LIST)) | sed -E 's/^([a-z]+):.*## (.*)/make \1	\2/' | expand -t 20
@@ -36,6 +36,9 @@ lint: $(STAMP) ## Check style, format and types.
 format: $(STAMP) ## Mend style and format where a tool can.
 	$(BIN)/ruff check --fix-only --quiet
 	$(BIN)/ruff format
+
+peers: $(STAMP) ## Install what the benchmarks compare with; they leave out what is missing.
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS),peers]'
 
 bench: $(STAMP) ## Run every benchmark, or those that BENCHMARKS names.
 	@set -e; for name in $(BENCHMARKS); do echo "== $$name"; $(BIN)/python -m experiments.benchmarks.$$name $(BENCH_ARGS); done

@@ -23,6 +23,7 @@ from jaxtyping import Array, Key
 from apt_jax.config import HParams
 from apt_jax.curricula.base import Metrics
 from apt_jax.trainer import Clock, Trainer, TrainState
+from apt_jax.turns import Turns
 
 Layout = Literal["auto", "vmap", "map"]
 
@@ -54,6 +55,7 @@ def make_program(
     *,
     layout: Layout = "auto",
     at_once: int | None = None,
+    resident: int | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Program:
     """Batch a trainer over `lanes`.
@@ -61,14 +63,24 @@ def make_program(
     Args:
       layout: how the lanes of one device are laid out; "auto" is "map" on CPU and "vmap" elsewhere.
       at_once: lanes of one device that "vmap" puts side by side, the others in turn, if not all fit its memory; all by default.
+      resident: lanes that one device's memory has room for; if there are more, groups of them take turns (`apt_jax.turns`), and
+        states are kept by the host.  All fit by default.
       devices: what to shard lanes over, by default every device of every process; no more are used than there are lanes.
 
     Raises:
-      ValueError: fewer than one lane, or than one at once, or fewer lanes than processes.
+      ValueError: fewer than one lane, or than one at once, or fewer lanes than processes, or several processes with more lanes
+        than there is room for.
     """
     if lanes < 1 or (at_once is not None and at_once < 1):
         raise ValueError(f"a program needs at least one lane and one at once, got {lanes} and {at_once}")
     used = _spread(devices or jax.devices(), lanes)
+    if resident is not None and lanes > resident * len(used):
+        group = resident * len(used)
+        if len({device.process_index for device in used}) > 1:
+            raise ValueError(f"the devices have room for {group} lanes, got {lanes}: take more hosts, or fewer seeds at a time")
+        program = make_program(trainer, group, layout=layout, at_once=at_once, devices=used)
+        mesh = Mesh(np.array(used), ("lane",))
+        return Program(*(Turns(function, lanes, group, mesh) for function in program))
     if layout == "auto":
         layout = "map" if used[0].platform == "cpu" else "vmap"
     mesh = Mesh(np.array(used), ("lane",))
@@ -105,6 +117,18 @@ def make_program(
         return chunk(states, clock, pad(hparams))
 
     return Program(init_all, warmup_all, chunk_all)
+
+
+def lane_bytes(trainer: Trainer) -> int:
+    """The size of one lane's state, most of it the replay."""
+    hparams = jax.tree.map(np.float32, HParams())
+    state = jax.eval_shape(trainer.init, jax.eval_shape(lambda: jax.random.key(0)), hparams)
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+
+
+def room(trainer: Trainer, memory: int) -> int:
+    """Lanes for which `memory` bytes of a device suffice: each with its state, and as much again for what a step computes."""
+    return max(memory // (2 * lane_bytes(trainer)), 1)
 
 
 def _spread(devices: Sequence[jax.Device], lanes: int) -> list[jax.Device]:

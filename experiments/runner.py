@@ -15,10 +15,11 @@ from jaxtyping import Array, Float, Key
 
 from apt_jax import checkpoint
 from apt_jax.config import HParams
-from apt_jax.lanes import Layout, make_program, stack_hparams
+from apt_jax.lanes import Layout, lane_bytes, make_program, room, stack_hparams
 from apt_jax.specs import Params
 from apt_jax.trainer import Clock, Trainer, TrainState
-from experiments import processes
+from apt_jax.turns import Turns
+from experiments import processes, runtime
 from experiments.errors import UsageError
 from experiments.settings import Experiment
 
@@ -36,8 +37,10 @@ class Runner:
     def __init__(self, trainer: Trainer, experiment: Experiment, layout: Layout, at_once: int | None = None):
         self._lanes = len(experiment.lanes)
         self._trainer = trainer
+        memory = runtime.device_memory()
+        resident = None if memory is None else room(trainer, memory)
         try:
-            self._program = make_program(trainer, self._lanes, layout=layout, at_once=at_once)
+            self._program = make_program(trainer, self._lanes, layout=layout, at_once=at_once, resident=resident)
         except ValueError as error:
             raise UsageError(str(error)) from error
         self._keys, self._hparams = lane_inputs(experiment)
@@ -48,6 +51,15 @@ class Runner:
         self._chunk: Callable[..., Any] = self._program.chunk
         self.generates = trainer.generates
         self.env_steps = 0
+
+    @property
+    def placement(self) -> str:
+        """How large the lanes are, and where they are if not all fit the devices."""
+        size = f"{self._lanes} lanes of {lane_bytes(self._trainer) / 2**20:.1f} MiB"
+        if not isinstance(self._program.chunk, Turns):
+            return size
+        group = self._program.chunk.group
+        return f"{size} do not fit the devices' memory: {group} at a time take turns, the others wait in the host's"
 
     def init(self) -> float:
         """Fresh states, before anything else; returns the seconds that compiling took."""

@@ -28,6 +28,11 @@ def setup(cpu_devices: int | None = None) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _MIN_COMPILE_SECONDS)
 
 
+def device_memory() -> int | None:
+    """Bytes that this process may use of a device's memory; None where the host's is used, as on CPU."""
+    return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit")
+
+
 def describe() -> dict[str, object]:
     """Versions, device and commit, for a run's summary."""
     devices = jax.devices()

@@ -65,9 +65,9 @@ def train(experiment: Experiment, session: Session) -> int:
         ExitStack() as stack,
     ):
         view.note(
-            f"{experiment.config.method} on {experiment.space}, seeds {' '.join(map(str, experiment.seeds))}, "
-            f"{len(names)} lanes, into {run.path}"
+            f"{experiment.config.method} on {experiment.space}, seeds {' '.join(map(str, experiment.seeds))}, into {run.path}"
         )
+        view.note(runner.placement)
         sinks = [stack.enter_context(closing(sink)) for sink in open_sinks(experiment, session, start)]
         times = Times(before=run_dir.wall_seconds(run.path))
         Training(experiment, session, runner, run, view, sinks, interrupt, times).run(start)

@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 
 from apt_jax.config import Config, HParams
-from experiments.benchmarks import _flops, _measure, environments, training_step, training_throughput
+from apt_jax.trainer import make_trainer
+from experiments.benchmarks import _flops, _measure, dqn_peers, environments, growth, training_step, training_throughput
 from experiments.benchmarks._grid_worlds import JaxWorld, restart
+from experiments.benchmarks._stretched import Stretched
 from tests.corridor import Corridor
 
 CONFIG = Config(
@@ -37,10 +39,17 @@ CONFIG = Config(
 )
 
 
+def one_second_each(*shape_and_args):
+    """Instead of timing matmuls, each shape a compilation: a product takes a second."""
+    return training_step.Matmul(*shape_and_args[:3], _measure.Timing((2.0,), 0.0), 1)
+
+
 @pytest.fixture(scope="module")
 def result():
     problem = _measure.Problem(Corridor(), np.int32(7), CONFIG, HParams())
-    return training_step.measure(problem, training_step.Args(repeats=2, at_least=0.0), rate=1e9)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training_step, "time_matmul", one_second_each)
+        return training_step.measure(problem, training_step.Args(repeats=2, at_least=0.0))
 
 
 def test_every_part_of_a_training_step_is_timed(result):
@@ -69,11 +78,27 @@ def test_results_of_a_training_step_are_json_and_a_table(result):
         "shortest_chunk",
         "model_update",
         "models",
-        "policy_update",
+        "work",
     }
-    text = training_step.tables("tiny", result)
+    text = training_step.tables("tiny", result, rate=1e9)
     assert "| sum of the parts |" in text
     assert "Whole / sum of the parts:" in text
+
+
+def test_the_work_of_a_training_step_is_counted(result):
+    policy, *models, jointly, step = result.work.values()
+    assert all(one.flops >= one.matmul_flops > 0 for one in result.work.values())
+    assert jointly.matmul_flops == sum(one.matmul_flops for one in models)
+    assert jointly.matmul_seconds == sum(one.matmul_seconds for one in models) > 10  # products
+    assert step.matmul_flops == CONFIG.updates_per_step * policy.matmul_flops + 0.5 * jointly.matmul_flops
+    text = training_step.work_table("one", {"half of it": training_step.Work(3e6, 2e6, 0.001, 0.004)}, rate=1e9)
+    assert "| half of it | 3 | 2 | 0.5 | 25.0% | 50.0% |" in text
+
+
+def test_a_matmul_is_timed_there_and_back():
+    matmul = training_step.time_matmul(2, 3, 4, training_step.Args(repeats=2, at_least=0.0))
+    assert matmul.flops == 2 * (2 * 2 * 3 * 4)
+    assert matmul.rate > 0
 
 
 def test_matmul_flops_count_the_runs_of_a_loop():
@@ -163,3 +188,57 @@ def test_throughputs_are_compared_with_ours():
     text = training_throughput.table({"ours": ours, "theirs": theirs}, training_throughput.Args(cores=2))
     assert "| ours | 50 (20 to 100) | 1 | 100 (100 to 100) | 1 | 3.0 |" in text
     assert "| theirs | 10 (10 to 10) | 5 | 20 (20 to 20) | 5 | 0.5 |" in text
+
+
+def test_q_learning_is_compared_with_ours():
+    results = {"ours": _measure.Timing((0.01, 0.02, 0.05), 3.0), "theirs": _measure.Timing((0.1,), 0.0)}
+    text = dqn_peers.table(results, updates=2)
+    assert "| ours | 50 (20 to 100) | 1 | 3.0 |" in text
+    assert "| theirs | 10 (10 to 10) | 5 | 0.0 |" in text
+
+
+def test_q_learning_without_peers_says_what_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["dqn_peers"])
+    monkeypatch.setattr(dqn_peers.importlib.util, "find_spec", lambda name: None)
+    assert dqn_peers.main() == 0
+    assert "gymnax, rejax, stable_baselines3 not installed" in capsys.readouterr().out
+
+
+def test_a_stretched_space_cuts_episodes_where_it_is_told_and_ignores_what_it_adds():
+    space = Stretched(Corridor(), horizon=20, more=3)
+    w = jax.jit(space.sample_uniform)(jax.random.key(0))
+    assert {name: block.shape for name, block in w.items()} == {"goal": (1,), "paint": (4, 4, 2), "more": (3,)}
+    assert space.instantiate({**w, "goal": jnp.array([4.5])}) == 4
+    state, _ = space.reset(jax.random.key(1), jnp.int32(7))
+    step = jax.jit(space.step)
+    for count in range(1, 21):
+        out = step(state, jnp.int32(0), jnp.int32(7))
+        assert out.truncated == (count == 20)
+        state = out.state
+
+
+def test_growth_is_measured_tabulated_and_drawn(tmp_path, monkeypatch):
+    """On the corridor, the usual run once for both axes."""
+    loaded = []
+
+    def load(point, quick):
+        loaded.append(point)
+        config = dataclasses.replace(CONFIG, method="dqn", replay_steps=100 * point.seeds)
+        return _measure.Problem(Stretched(Corridor(), horizon=12, more=0), np.int32(7), config, HParams())
+
+    monkeypatch.setattr(growth, "load_problem", load)
+    args = growth.Args(repeats=2)
+    sizes = {"seeds": (1, 2), "parameter": (growth.PARAMETER,)}
+    costs = {axis: {size: growth.measure(growth.at(axis, size), args) for size in sizes[axis]} for axis in sizes}
+    assert loaded == [growth.Point(), growth.Point(seeds=2)]
+    assert costs["seeds"][2].state > costs["seeds"][1].state > 0
+    assert "| 2 (2) | " in growth.tables(costs)
+    growth.draw(tmp_path / "growth.png", costs)
+    assert (tmp_path / "growth.png").stat().st_size > 0
+
+
+def test_every_size_of_growth_fits_the_preset():
+    for axis, sizes in growth.AXES.items():
+        for size in sizes:
+            problem = growth.load_problem(growth.at(axis, size), quick=True)
+            make_trainer(problem.space, problem.target, problem.config)

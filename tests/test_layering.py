@@ -21,6 +21,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"bonuses", "curricula", "learner"}),
     frozenset({"evaluation", "methods", "workers"}),
     frozenset({"trainer"}),
+    frozenset({"turns"}),
     frozenset({"checkpoint", "lanes", "logging"}),
     frozenset({"__init__"}),  # the package's own face
 )

@@ -110,6 +110,19 @@ def test_two_processes_train_as_one_and_one_goes_on_for_both(tmp_path, start, wh
     assert_same_run(run, whole)
 
 
+def test_a_seed_is_the_same_on_eight_devices(tmp_path, start, whole):
+    """Two chunks of nine lanes, as on two devices up to the order of float sums; `test_trainer` compares two with one."""
+    run = tmp_path / "run"
+    options = ["--target", "far", "--method", "random", *OPTIONS, "--env-steps", "80", "--devices", "8"]
+    with start("--run-dir", str(run), *options) as process:
+        process.communicate()
+    assert process.returncode == 0
+    for row, expected in zip(rows(run), rows(whole)[: 9 * 2], strict=True):
+        assert row.keys() == expected.keys()
+        values, wanted = (np.array(list(one.values()), float) for one in (row, expected))
+        np.testing.assert_allclose(values, wanted, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.filterwarnings("ignore")  # Ray's own
 def test_a_job_whose_worker_is_killed_goes_on_from_its_checkpoint(tmp_path, monkeypatch, cache, whole, capfd):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(cache))

@@ -36,6 +36,9 @@ LOW, HIGH = -0.05, 0.05
 TOLERANCE = 1e-5
 """Largest difference, as a share of an array's largest number."""
 
+ROUNDING = 1e-7
+"""Largest difference besides: of a number in which others around one have cancelled."""
+
 
 @dataclasses.dataclass
 class Sides:
@@ -50,10 +53,13 @@ class Sides:
     models: _torch_models.Models
 
 
-@pytest.fixture(scope="module", params=PRESETS)
+@pytest.fixture(scope="module", params=[("paper", False), ("fast", True)], ids=["paper", "fast"])
 def sides(request):
-    config, hparams = PRESETS[request.param]
-    config = dataclasses.replace(config, warmup_steps=1_000, replay_steps=2_000, recent_steps=500, model_batch_size=32)
+    """A preset without `judge_parts`, and one with it."""
+    preset, judge_parts = request.param
+    config, hparams = PRESETS[preset]
+    sizes = {"warmup_steps": 1_000, "replay_steps": 2_000, "recent_steps": 500, "model_batch_size": 32}
+    config = dataclasses.replace(config, judge_parts=judge_parts, **sizes)
     trainer = make_trainer(SPACE, envs.load_target("grid_world", "A"), config)
     state = jax.jit(trainer.init)(jax.random.key(0), hparams)
     state, clock = jax.jit(trainer.warmup)(state, Clock.start(), hparams)
@@ -89,7 +95,7 @@ def tensors(tree):
 def assert_close(theirs, ours):
     theirs, ours = (np.asarray(x.detach() if isinstance(x, torch.Tensor) else x) for x in (theirs, ours))
     assert theirs.shape == ours.shape
-    np.testing.assert_allclose(theirs, ours, rtol=0, atol=TOLERANCE * np.abs(ours).max())
+    np.testing.assert_allclose(theirs, ours, rtol=0, atol=TOLERANCE * np.abs(ours).max() + ROUNDING)
 
 
 def assert_gradients_close(pairs):
@@ -191,7 +197,7 @@ def test_the_discriminator_is_the_same(sides):
         for vector, moved in torch_weights.singular_vectors(models.discriminator, spectral):
             assert_close(vector, moved)
     progress = task_progress(logit, relative=sides.config.relative_progress)
-    assert_close(_torch_models.task_progress(their_logit, relative=sides.config.relative_progress), progress)
+    assert_close(_torch_models.task_progress(tensors(logit), relative=sides.config.relative_progress), progress)
 
 
 def test_the_values_are_the_same(sides):

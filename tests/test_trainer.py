@@ -15,7 +15,7 @@ from jax.sharding import PartitionSpec
 import envs
 from apt_jax import checkpoint
 from apt_jax.config import PRESETS, Config, HParams
-from apt_jax.lanes import _spread, make_program, stack_hparams
+from apt_jax.lanes import _spread, lane_bytes, make_program, room, stack_hparams
 from apt_jax.methods import METHODS, Method, parse_method
 from apt_jax.trainer import Clock, diversity, make_trainer
 from tests.corridor import Corridor
@@ -183,6 +183,13 @@ def test_fewer_lanes_than_devices_are_shared_by_all_processes():
     assert _spread(devices, 9) == devices
     with pytest.raises(ValueError, match=r"2 processes need at least a lane each .* got 1"):
         _spread(devices, 1)
+
+
+def test_there_is_room_for_as_many_lanes_as_the_memory_holds_twice():
+    trainer = make_trainer(SPACE, TARGET, config("dqn"))
+    state = jax.tree.leaves(jax.eval_shape(trainer.init, jax.random.key(0), jax.tree.map(jnp.float32, HParams())))
+    assert lane_bytes(trainer) == sum(leaf.size * leaf.dtype.itemsize for leaf in state)
+    assert [room(trainer, memory) for memory in (1, 7 * lane_bytes(trainer))] == [1, 3]
 
 
 def test_a_method_is_a_curriculum_and_a_bonus():

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
@@ -87,6 +88,11 @@ class Timing:
     def cell(self, unit: float = 1e-3) -> str:
         """Median and range in multiples of `unit` seconds, for a table."""
         median, low, high = (number(s / unit) for s in (self.median, min(self.seconds), max(self.seconds)))
+        return f"{median} ({low} to {high})"
+
+    def rate(self, count: float = 1.0) -> str:
+        """Median and range of how many things a second are done, `count` of them in a run, for a table."""
+        median, low, high = (number(count / s) for s in (self.median, max(self.seconds), min(self.seconds)))
         return f"{median} ({low} to {high})"
 
 
@@ -164,6 +170,14 @@ def time_calls(
     """
     carry = jax.tree.map(jnp.copy, carry)
     compiled, compile_seconds = compile_ahead(jax.jit(function, donate_argnums=0), *carry, fixed)
+    seconds, carry = time_runs(compiled, carry, fixed, repeats=repeats)
+    return Timing(seconds, compile_seconds), carry
+
+
+def time_runs(
+    compiled: Callable[..., tuple[Any, ...]], carry: tuple[Any, ...], fixed: Any, *, repeats: int
+) -> tuple[tuple[float, ...], tuple[Any, ...]]:
+    """The seconds of each run of `(*carry, output) = compiled(*carry, fixed)` but the first, and the carry after all runs."""
 
     def run() -> float:
         nonlocal carry
@@ -174,10 +188,10 @@ def time_calls(
         return time.perf_counter() - began
 
     run()
-    return Timing(tuple(run() for _ in range(repeats)), compile_seconds), carry
+    return tuple(run() for _ in range(repeats)), carry
 
 
-def compile_ahead(function: Callable[..., Any], *args: Any) -> tuple[Callable[..., Any], float]:
+def compile_ahead(function: Callable[..., Any], *args: Any) -> tuple[Any, float]:
     """A jitted function compiled for some arguments, and the seconds that took."""
     began = time.perf_counter()
     compiled = cast(jax.stages.Wrapped, function).lower(*args).compile()
@@ -196,6 +210,18 @@ def peak_memory() -> int:
     return peak if sys.platform == "darwin" else 1024 * peak
 
 
+def versions(packages: Sequence[str]) -> dict[str, str | None]:
+    """The installed version of each package, None of one that is missing."""
+
+    def version(package: str) -> str | None:
+        try:
+            return metadata.version(package)
+        except metadata.PackageNotFoundError:
+            return None
+
+    return {package: version(package) for package in packages}
+
+
 def number(value: float) -> str:
     """Three significant digits, never in exponential form."""
     return f"{float(f'{value:.3g}'):,.12g}"
@@ -207,12 +233,17 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
+def result_path(name: str, options: Options) -> Path:
+    """The file that a benchmark's raw numbers go to."""
+    return options.out or Path("runs") / "benchmarks" / f"{name}.json"
+
+
 def report(name: str, options: Options, results: Mapping[str, Any], text: str) -> None:
     """Prints the tables and writes the raw numbers with all that is needed to read them."""
     environment = {**runtime.describe(), "cpu": _cpu_model(), "cores": os.cpu_count(), "load_average": _LOAD_AVERAGE}
     settings = {key: value for key, value in dataclasses.asdict(options).items() if key != "out"}
     content = {"benchmark": name, "settings": settings, "environment": environment, "results": results}
-    path = options.out or Path("runs") / "benchmarks" / f"{name}.json"
+    path = result_path(name, options)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1, default=dataclasses.asdict) + "\n")
     print(f"{text}\n{_caption(environment)}\nRaw numbers: {path}")

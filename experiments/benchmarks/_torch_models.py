@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from apt_jax.config import Config, HParams
@@ -68,16 +68,19 @@ class Models:
         def join(a: Tensors, b: Tensors) -> Tensors:
             return {name: torch.cat([a[name], b[name]]) for name in a}
 
-        logits = self.discriminator(
+        initial, steps = self.discriminator(
             join(target.initial_obs, generated.initial_obs),
             join(target.obs, generated.obs),
             torch.cat([target.action, generated.action]),
             reward=torch.cat([target.reward, generated.reward]),
             next_obs=join(target.next_obs, generated.next_obs),
-            length=torch.cat([target.length, generated.length]),
         )
-        target_logit, generated_logit = logits.chunk(2)
-        return F.softplus(-target_logit).mean() + F.softplus(generated_logit).mean(), generated_logit
+        if self.config.judge_parts:
+            loss, logit = 0.5 * (tell_apart(initial) + tell_apart(steps)), pool_probabilities(initial, steps)
+        else:
+            logit = pool(initial, steps, torch.cat([target.length, generated.length]))
+            loss = tell_apart(logit)
+        return loss, logit.chunk(2)[1]
 
     def value_loss(self, w: Tensors, progress: Float[Tensor, "B"], episode_return: Float[Tensor, "B"]) -> Float[Tensor, ""]:
         """Mean squared errors of every network of both ensembles, summed."""
@@ -102,6 +105,22 @@ class Models:
         self.optimizer.zero_grad()
         (discriminator_loss + value_loss + generator_loss).backward()
         self._descend()
+
+
+def tell_apart(logits: Float[Tensor, "2*B *k"]) -> Float[Tensor, ""]:
+    """Cross-entropy of what belongs to the target, the first half, and what was generated."""
+    target, generated = logits.chunk(2)
+    return F.softplus(-target).mean() + F.softplus(generated).mean()
+
+
+def pool(initial: Float[Tensor, "n"], steps: Float[Tensor, "n K"], length: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """The mean logit of a rollout's initial observation and of all its steps, estimated from K of these."""
+    return (initial + length * steps.mean(dim=-1)) / (1 + length)
+
+
+def pool_probabilities(initial: Float[Tensor, "n"], steps: Float[Tensor, "n K"]) -> Float[Tensor, "n"]:
+    """The logit of a mean probability, half of it the initial observation's."""
+    return (0.5 * (initial.sigmoid() + steps.sigmoid().mean(dim=-1))).logit(eps=1e-6)
 
 
 def evaluate(ensemble: nn.ModuleList, w: Tensors) -> Float[Tensor, "K n"]:

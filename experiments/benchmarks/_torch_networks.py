@@ -117,7 +117,7 @@ class ValueNetwork(nn.Module):
 
 
 class Discriminator(nn.Module):
-    """A logit of each rollout: the mean over its initial observation and its steps, estimated from K of the steps.
+    """A logit of each rollout's initial observation, [B], and of K of its steps, [B, K].
 
     Args:
       spectral_bound: largest spectral norm that a layer's weight is used with.
@@ -144,15 +144,14 @@ class Discriminator(nn.Module):
         *,
         reward: Float[Tensor, "B K"],
         next_obs: Tensors,
-        length: Int[Tensor, "B"],
-    ) -> Float[Tensor, "B"]:
+    ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B K"]]:
         initial = self.init_head(self.init_encoder(observation_features(initial_obs))).squeeze(-1)
         both = {name: torch.cat([obs[name], next_obs[name]]).flatten(0, 1) for name in obs}
         state, next_state = self.state_encoder(observation_features(both)).chunk(2)
         action_encoding = F.relu(self.action_encoder(F.one_hot(action.flatten(), ACTIONS).float()))
         reward_encoding = F.relu(self.reward_encoder(reward.reshape(-1, 1)))
         steps = self.step_head(torch.cat([state, action_encoding, reward_encoding, next_state], dim=-1))
-        return (initial + length * steps.view_as(reward).mean(dim=-1)) / (1 + length)
+        return initial, steps.view_as(reward)
 
 
 class SpectralBound(nn.Module):

@@ -37,7 +37,6 @@ class Args(Options):
       cores: cores that the process may use.
     """
 
-    repeats: int = 2
     preset: Literal["paper", "fast"] = "fast"
     seeds: int = 1
     cores: int = 2

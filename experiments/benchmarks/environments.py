@@ -23,7 +23,6 @@ import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import metadata
 from typing import Any, TypeAlias
 
 import jax
@@ -92,7 +91,7 @@ def main() -> int:
             print(f"left out: {name} ({error})")
             continue
         walks[name] = walk(world, args) if isinstance(world, JaxWorld) else walk_in_python(world, args)
-    results = {"versions": {package: _version(package) for package in PEERS}, "walks": walks}
+    results = {"versions": _measure.versions(PEERS), "walks": walks}
     _measure.report("environments", args, results, tables(walks, args.batches))
     return 0
 
@@ -163,7 +162,7 @@ def tables(walks: Mapping[str, Walk], batches: Sequence[int]) -> str:
     """Steps per second, what ours are to the others', and what else is worth knowing."""
     columns = [f"{n:,} side by side" for n in batches]
     rates = _measure.table(
-        ["steps per second", *columns], [[name, *(_rate(walk.step[n], n) for n in batches)] for name, walk in walks.items()]
+        ["steps per second", *columns], [[name, *(walk.step[n].rate(n) for n in batches)] for name, walk in walks.items()]
     )
     (_, ours), *others = walks.items()
     ratios = _measure.table(
@@ -178,19 +177,6 @@ def tables(walks: Mapping[str, Walk], batches: Sequence[int]) -> str:
         ],
     )
     return "\n".join((rates, ratios, rest))
-
-
-def _rate(step: Timing, n: int) -> str:
-    """Median and range of environment steps per second."""
-    median, low, high = (_measure.number(n / seconds) for seconds in (step.median, max(step.seconds), min(step.seconds)))
-    return f"{median} ({low} to {high})"
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 if __name__ == "__main__":

@@ -42,7 +42,6 @@ class Args(Options):
       true_pushes: pushes with true shapes that are timed.
     """
 
-    repeats: int = 3
     space: Literal["manipulation", "manipulation_sawyer"] = "manipulation"
     envs: tuple[int, ...] = (1, 16, 64, 256)
     cores: int = 1
@@ -74,11 +73,11 @@ def main() -> int:
     same, true = time_same_model(args), time_true_shapes(args)
     faults = count_faults(args.space, args.checked)
     rows = [
-        [f"MJX, {n} side by side", _cell(side.timing, n), *_costs(side.timing, n), f"{side.peak_memory / 2**20:.0f}"]
+        [f"MJX, {n} side by side", side.timing.rate(n), *_costs(side.timing, n), f"{side.peak_memory / 2**20:.0f}"]
         for n, side in sides.items()
     ]
-    rows.append(["MuJoCo, same model", _cell(same, 1), *_costs(same, 1), ""])
-    rows.append(["MuJoCo, true shapes", _cell(true, 1), *_costs(true, 1), ""])
+    rows.append(["MuJoCo, same model", same.rate(), *_costs(same, 1), ""])
+    rows.append(["MuJoCo, true shapes", true.rate(), *_costs(true, 1), ""])
     header = ["pushes", "per second", "minutes per 100,000", "compile, s", "peak memory, MiB"]
     text = f"{_measure.table(header, rows)}\n{faults} of {args.checked:,} random pushes gave what is not a number.\n"
     results = {"side_by_side": sides, "same_model": same, "true_shapes": true, "faults": faults}
@@ -181,10 +180,6 @@ def count_faults(space: str, pushes: int) -> int:
         return jnp.sum(~jnp.all(jnp.stack([jnp.isfinite(x).reshape(batch, -1).all(axis=1) for x in leaves]), axis=0))
 
     return sum(int(faults(jax.random.key(1 + i))) for i in range(-(-pushes // batch)))
-
-
-def _cell(timing: Timing, n: int) -> str:
-    return _measure.number(n / timing.median)
 
 
 def _costs(timing: Timing, n: int) -> tuple[str, str]:

@@ -42,7 +42,6 @@ class Args(Options):
       chunk_steps: environment steps per measurement; a multiple of ALP-GMM's 5,000 steps between fits counts those rightly.
     """
 
-    repeats: int = 3
     methods: tuple[str, ...] = (BASE, *(method for method in METHODS if method != BASE))
     preset: Literal["paper", "fast"] = "fast"
     cores: int = 1

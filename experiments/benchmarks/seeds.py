@@ -38,7 +38,6 @@ class Args(Options):
       chunk_steps: environment steps of each seed per measurement.
     """
 
-    repeats: int = 3
     seeds: tuple[int, ...] = (1, 2, 4, 8, 16)
     layouts: tuple[Literal["map", "vmap"], ...] = ("map", "vmap")
     devices: tuple[int, ...] = (1, 2)

@@ -7,8 +7,9 @@ training has reached, and the whole chunk as it is: what the whole takes beyond 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal
 
 import jax
@@ -27,7 +28,7 @@ LARGE_MATMUL = (1024, 1024, 1024)
 
 @dataclass(frozen=True)
 class Args(Options):
-    """Time the parts of a training step, and what share of the machine's matmul rate the policy updates reach.
+    """Time the parts of a training step, and what share of the machine's matmul rate they reach.
 
     Attributes:
       presets: what to time.
@@ -61,23 +62,24 @@ class Matmul:
 
 
 @dataclass(frozen=True)
-class PolicyUpdate:
-    """One policy update against the rate of `Matmul`s as large as its largest.
+class Work:
+    """The operations of something, and how long it takes.
 
     Attributes:
-      matmul_flops: operations of its matmuls, from the shapes in its jaxpr.
-      compiled_flops: all its operations as the compiler estimates them.
-      matmul_share: of the matmul rate that its matmuls are done at; everything else it does lowers the share.
-      matmul_share_with_sampling: the same with the time to sample its batch added.
-      own_shapes_share: the share that its matmuls would reach if nothing else took any time, each as fast as its own shape
-        alone: the rest up to 1 is owed to matrices smaller than the one that the rate is of.
+      flops: all operations as the compiler estimates them.
+      matmul_flops: those of its matmuls, from the shapes in its jaxpr.
+      matmul_seconds: what its matmuls would take by themselves, each at the rate of its own shape.
+      seconds: what it takes.
     """
 
-    matmul_flops: int
-    compiled_flops: float
-    matmul_share: float
-    matmul_share_with_sampling: float
-    own_shapes_share: float
+    flops: float
+    matmul_flops: float
+    matmul_seconds: float
+    seconds: float
+
+    def times(self, count: float) -> Work:
+        """So many of it."""
+        return Work(*(count * value for value in dataclasses.astuple(self)))
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,7 @@ class Result:
       shortest_chunk: a chunk of one iteration; without the parts of an iteration it gives the evaluation's time.
       model_update: one round of `curriculum.update`.
       models: pieces of such a round, each alone.
+      work: of one update of each kind, and of an environment step without its share of the evaluation.
     """
 
     config: Config
@@ -99,7 +102,7 @@ class Result:
     shortest_chunk: Timing
     model_update: Timing
     models: dict[str, Timing]
-    policy_update: PolicyUpdate
+    work: dict[str, Work]
 
     @property
     def sum_of_parts(self) -> float:
@@ -118,20 +121,22 @@ def main() -> int:
         args = dataclasses.replace(args, repeats=1, at_least=0.0)
     matmuls = [time_matmul(*shape, args) for shape in (MERGE_MATMUL, LARGE_MATMUL)]
     problems = {preset: _measure.load_problem(preset, **(_measure.QUICK if args.quick else {})) for preset in args.presets}
-    results = {preset: measure(problem, args, rate=matmuls[0].rate) for preset, problem in problems.items()}
-    text = "\n".join([matmul_table(matmuls), *(tables(preset, result) for preset, result in results.items())])
+    results = {preset: measure(problem, args) for preset, problem in problems.items()}
+    rate = matmuls[0].rate
+    text = "\n".join([matmul_table(matmuls), *(tables(preset, result, rate) for preset, result in results.items())])
     _measure.report("training_step", args, {"matmuls": matmuls, "presets": results}, text)
     return 0
 
 
+@cache
 def time_matmul(rows: int, inner: int, columns: int, args: Args) -> Matmul:
-    """The rate of one shape of matmul."""
+    """The rate of one shape of matmul; parts have many shapes in common."""
     timing, flops = _flops.time_matmuls(rows, inner, columns, repeats=args.repeats, at_least=args.at_least)
     return Matmul(rows, inner, columns, timing, flops)
 
 
-def measure(problem: Problem, args: Args, *, rate: float) -> Result:
-    """Everything about one preset; `rate`, in operations per second, is what policy updates are compared with."""
+def measure(problem: Problem, args: Args) -> Result:
+    """Everything about one preset."""
     config = problem.config
     steps = _parts.SOURCES * config.envs_per_source
     chunk, (state, clock) = time_chunk(problem, *start(problem), args.repeats)
@@ -148,28 +153,43 @@ def measure(problem: Problem, args: Args, *, rate: float) -> Result:
     evaluation = dataclasses.replace(shortest, seconds=tuple(max(seconds - others, 0.0) for seconds in shortest.seconds))
     parts["evaluate"] = evaluation.per(config.eval_every)
 
+    chunk = chunk.per(config.eval_every)
+    model_pieces = _parts.model_parts(problem, state, clock)
+    models = {name: time_part(piece) for name, piece in model_pieces.items()}
+    model_update = timings["update models"].per(round(config.model_updates_per_step * steps))
+
     batches, _ = pieces["update policy"].fixed
     batch = jax.tree.map(lambda x: x[0], batches)
-    update = partial(_parts.policy_update, problem)
-    shapes = _flops.matmuls(update, state, batch)
-    matmul_flops = _flops.matmul_flops(update, state, batch)
-    own_shapes = sum(count * time_matmul(*shape, args).timing.median / 2 for shape, count in shapes.items())
-    useful = config.updates_per_step * matmul_flops / rate  # seconds per environment step, were all else free
-    return Result(
-        config=config,
-        parts=parts,
-        chunk=chunk.per(config.eval_every),
-        shortest_chunk=shortest,
-        model_update=timings["update models"].per(round(config.model_updates_per_step * steps)),
-        models={name: time_part(piece) for name, piece in _parts.model_parts(problem, state, clock).items()},
-        policy_update=PolicyUpdate(
-            matmul_flops=matmul_flops,
-            compiled_flops=_flops.compiled_flops(update, state, batch),
-            matmul_share=useful / parts["update policy"].median,
-            matmul_share_with_sampling=useful / (parts["update policy"].median + parts["sample"].median),
-            own_shapes_share=matmul_flops / rate / own_shapes,
-        ),
+    policy_seconds = parts["update policy"].median / config.updates_per_step
+    work = {"policy update": count(partial(_parts.policy_update, problem), state, batch, seconds=policy_seconds, args=args)}
+    for name in ("discriminator", "values", "generator"):
+        piece = model_pieces[name]
+        inputs = piece.state, piece.fixed, jax.random.key(0), clock.iteration
+        work[name] = count(piece.step, *inputs, seconds=models[name].median, args=args)
+    policy, *alone = work.values()
+    work["the last three, jointly"] = together(alone, seconds=model_update.median)
+    work["environment step"] = together(
+        [policy.times(config.updates_per_step), *(piece.times(config.model_updates_per_step) for piece in alone)],
+        seconds=chunk.median - parts["evaluate"].median,
     )
+    return Result(config, parts, chunk, shortest, model_update, models, work)
+
+
+def count(function: Callable[..., Any], *inputs: Any, seconds: float, args: Args) -> Work:
+    """The work of a function without loops that takes `seconds`."""
+    shapes = _flops.matmuls(function, *inputs)
+    return Work(
+        flops=_flops.compiled_flops(function, *inputs),
+        matmul_flops=_flops.matmul_flops(function, *inputs),
+        matmul_seconds=sum(n * time_matmul(*shape, args).timing.median / 2 for shape, n in shapes.items()),
+        seconds=seconds,
+    )
+
+
+def together(pieces: Sequence[Work], *, seconds: float) -> Work:
+    """What several do, in `seconds`."""
+    sums = [sum(values) for values in zip(*map(dataclasses.astuple, pieces), strict=True)]
+    return dataclasses.replace(Work(*sums), seconds=seconds)
 
 
 def start(problem: Problem) -> tuple[TrainState, Clock]:
@@ -194,9 +214,26 @@ def matmul_table(matmuls: list[Matmul]) -> str:
     return _measure.table(["float32 matmul", "microseconds", "GFLOP/s"], rows)
 
 
-def tables(preset: str, result: Result) -> str:
-    """A preset's results, for people."""
-    chunk, total, policy = result.chunk, result.sum_of_parts, result.policy_update
+def work_table(title: str, work: Mapping[str, Work], rate: float) -> str:
+    """How much of the machine's matmul rate is reached, if all that is no matmul counts as lost time."""
+    rows = [
+        [
+            name,
+            _measure.number(one.flops / 1e6),
+            _measure.number(one.matmul_flops / 1e6),
+            _measure.number(one.matmul_flops / one.seconds / 1e9),
+            f"{one.matmul_seconds / one.seconds:.1%}",
+            f"{one.matmul_flops / one.seconds / rate:.1%}",
+        ]
+        for name, one in work.items()
+    ]
+    header = [title, "MFLOP", "in matmuls", "GFLOP/s of these", "of the rate at its own shapes", "of the first matmul's rate"]
+    return _measure.table(header, rows)
+
+
+def tables(preset: str, result: Result, rate: float) -> str:
+    """A preset's results, for people; `rate` is that of the first matmul, in operations per second."""
+    chunk, total = result.chunk, result.sum_of_parts
     rows = [
         [name, timing.cell(), f"{timing.median / total:.1%}", f"{timing.compile_seconds:.1f}"]
         for name, timing in result.parts.items()
@@ -216,10 +253,7 @@ def tables(preset: str, result: Result) -> str:
             _measure.table([f"{preset}: part", "ms per step", "of the sum", "compile, s"], rows),
             f"Whole / sum of the parts: {chunk.median / total:.3f}.\n",
             _measure.table([f"{preset}: piece of a model update", "ms", "of the pieces' sum"], model_rows),
-            f"A policy update does {policy.matmul_flops / 1e6:.1f} MFLOP in matmuls ({policy.compiled_flops / 1e6:.1f} MFLOP "
-            f"in all by the compiler's count), at {policy.matmul_share:.1%} of the rate of the first matmul above; "
-            f"{policy.matmul_share_with_sampling:.1%} with sampling.  Its matmuls alone, each at the rate of its own shape, "
-            f"would reach {policy.own_shapes_share:.1%}.\n",
+            work_table(f"{preset}: one", result.work, rate),
         ]
     )
 

@@ -24,7 +24,6 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
-from importlib import metadata
 from typing import Any, Literal
 
 import jax
@@ -85,8 +84,8 @@ def main() -> int:
         print("left out: PyTorch (not installed)")
         args = dataclasses.replace(args, peers=())
     results = measure(args)
-    versions = {"torch": metadata.version("torch") if args.peers else None}
-    _measure.report("training_throughput", args, {"versions": versions, "sides": results}, table(results, args))
+    content = {"versions": _measure.versions(["torch"]), "sides": results}
+    _measure.report("training_throughput", args, content, table(results, args))
     return 0
 
 
@@ -225,9 +224,9 @@ def table(results: Mapping[str, Throughput], args: Args) -> str:
     rows = [
         [
             name,
-            rate(side.one_core),
+            side.one_core.rate(),
             _measure.number(side.one_core.median / ours.one_core.median),
-            rate(side.machine),
+            side.machine.rate(),
             _measure.number(side.machine.median / ours.machine.median),
             f"{side.one_core.compile_seconds:.1f}",
         ]
@@ -244,12 +243,6 @@ def table(results: Mapping[str, Throughput], args: Args) -> str:
         ],
         rows,
     )
-
-
-def rate(step: Timing) -> str:
-    """Median and range of environment steps per second."""
-    median, low, high = (_measure.number(1.0 / seconds) for seconds in (step.median, max(step.seconds), min(step.seconds)))
-    return f"{median} ({low} to {high})"
 
 
 if __name__ == "__main__":

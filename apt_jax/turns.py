@@ -1,0 +1,76 @@
+"""Lanes that do not all fit the devices' memory: groups of them take turns, the others wait in the host's."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from apt_jax.trainer import Clock
+
+
+@dataclass(frozen=True)
+class Turns:
+    """A function of G lanes made one of L: called for every G of them, one call after the other.
+
+    Arguments and results have leaves [L, ...], but for the clock, which all lanes share.  Results are on the host's first CPU
+    device: at any time the devices hold no more than a group.
+
+    Attributes:
+      function: jitted, of arrays with leaves [G, ...]; `lower` and `compile` do with it what they do with a jitted function.
+      lanes: L.
+      group: G.
+      mesh: the devices that each group is spread over, on an axis "lane".
+    """
+
+    function: Callable[..., Any]
+    lanes: int
+    group: int
+    mesh: Mesh
+
+    def __call__(self, *args: Any) -> Any:
+        """The results of all groups."""
+        host = NamedSharding(Mesh(np.array(jax.devices("cpu")[:1]), ("lane",)), PartitionSpec("lane"))
+        groups = []
+        for start in range(0, self.lanes, self.group):
+            results = _each(lambda tree: jax.device_put(tree, host), self.function(*self._take(start, args)))
+            groups.append(jax.block_until_ready(results))  # the next group needs this one's room
+
+        def join(*trees: Any) -> Any:
+            joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: self.lanes], *trees)
+            return jax.device_put(joined, host)
+
+        return _each(join, *groups)
+
+    def lower(self, *args: Any) -> Turns:
+        """As of a jitted function."""
+        return dataclasses.replace(self, function=self.function.lower(*self._take(0, args)))  # type: ignore[attr-defined]
+
+    def compile(self) -> Turns:
+        """As of a lowered one."""
+        return dataclasses.replace(self, function=self.function.compile())  # type: ignore[attr-defined]
+
+    def _take(self, start: int, args: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The arguments of the group that begins with lane `start`, on its devices; the very last lane fills the last group."""
+        rows = np.minimum(np.arange(start, start + self.group), self.lanes - 1)
+        shared, lane = (NamedSharding(self.mesh, spec) for spec in (PartitionSpec(), PartitionSpec("lane")))
+
+        def take(arg: Any) -> Any:
+            if isinstance(arg, Clock):
+                return jax.device_put(arg, shared)
+            return jax.device_put(jax.tree.map(lambda x: x[rows], arg), lane)
+
+        return tuple(map(take, args))
+
+
+def _each(function: Callable[..., Any], *results: Any) -> Any:
+    """What `function` makes of results, or of each of several together; of clocks the last stays as it is."""
+    if isinstance(results[0], tuple) and not hasattr(results[0], "_fields"):
+        return tuple(_each(function, *parts) for parts in zip(*results, strict=True))
+    return results[-1] if isinstance(results[0], Clock) else function(*results)

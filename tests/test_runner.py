@@ -1,0 +1,67 @@
+"""Seeds that do not fit the devices' memory take turns on them, and nothing else changes."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from apt_jax.config import Config
+from apt_jax.lanes import lane_bytes
+from apt_jax.trainer import make_trainer
+from experiments import runtime
+from experiments.runner import Runner
+from experiments.settings import Experiment
+from tests.corridor import Corridor
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    """Five seeds of a run on the corridor, and its trainer."""
+    config = Config(
+        method="dqn",
+        warmup_steps=40,
+        updates_per_step=1,
+        batch_size=4,
+        replay_steps=60,
+        replay_episodes=8,
+        recent_steps=20,
+        refresh_every=20,
+        eval_every=20,
+        eval_episodes=2,
+        probe_tasks=2,
+        return_window=8,
+    )
+    return Experiment(seeds=(3, 0, 4, 1, 2), config=config), make_trainer(Corridor(), np.int32(7), config)
+
+
+def start(experiment, trainer):
+    """A runner that is compiled, but has not run."""
+    runner = Runner(trainer, experiment, "map")
+    runner.init()
+    runner.compile()
+    return runner
+
+
+def test_seeds_that_do_not_fit_take_turns(experiment, monkeypatch, tmp_path):
+    """Two devices with room for one seed each, against all at once; and a checkpoint of one goes on in the other."""
+    together = start(*experiment)
+    assert together.placement.startswith("5 lanes of 0.")
+    monkeypatch.setattr(runtime, "device_memory", lambda: 2 * lane_bytes(experiment[1]))
+    in_turns = start(*experiment)
+    assert in_turns.placement.endswith("do not fit the devices' memory: 2 at a time take turns, the others wait in the host's")
+
+    for runner in (together, in_turns):
+        runner.warmup()
+    expected, metrics = together.advance(), in_turns.advance()
+    assert metrics.keys() == expected.keys()
+    for name, values in metrics.items():
+        np.testing.assert_array_equal(values, expected[name])
+
+    in_turns.save(tmp_path)
+    expected = together.advance()
+    for runner in (in_turns, together):
+        runner.restore(tmp_path)
+        assert runner.env_steps == 60
+        np.testing.assert_array_equal(runner.advance()["td_loss"], expected["td_loss"])
+        assert all(leaf.shape[0] == 5 for leaf in jax.tree.leaves(runner.policies()))
