@@ -32,8 +32,6 @@ F = TypeVar("F")
 P = ParamSpec("P")
 R = TypeVar("R")
 
-SPACE, TARGET = "grid_world", "A"
-
 _LOAD_AVERAGE = os.getloadavg()
 """Before the benchmark starts: above zero, something else was running and the timings are not to be trusted."""
 
@@ -105,10 +103,10 @@ class Problem(NamedTuple):
     hparams: HParams
 
 
-def load_problem(preset: str, **changes: Any) -> Problem:
-    """A preset with some fields of its config changed."""
+def load_problem(preset: str, *, space: str = "grid_world", **changes: Any) -> Problem:
+    """A preset with some fields of its config changed, and target A of a space."""
     config, hparams = PRESETS[preset]
-    return Problem(envs.make(SPACE), envs.load_target(SPACE, TARGET), dataclasses.replace(config, **changes), hparams)
+    return Problem(envs.make(space), envs.load_target(space, "A"), dataclasses.replace(config, **changes), hparams)
 
 
 def check(options: Options) -> None:

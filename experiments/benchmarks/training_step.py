@@ -1,6 +1,6 @@
 """Where the time of an environment step goes: `python -m experiments.benchmarks.training_step`.
 
-One seed of APT-Gen on Grid-World A.  Each part of an iteration is timed by itself in a compiled loop, from a state that
+One seed of APT-Gen on target A of a space.  Each part of an iteration is timed by itself in a compiled loop, from a state that
 training has reached, and the whole chunk as it is: what the whole takes beyond the sum of its parts is lost between them.
 """
 
@@ -31,11 +31,13 @@ class Args(Options):
     """Time the parts of a training step, and what share of the machine's matmul rate they reach.
 
     Attributes:
+      space: where to train.
       presets: what to time.
       cores: cores that the process may use.
       at_least: seconds that one measurement of a part takes at least.
     """
 
+    space: Literal["grid_world", "manipulation"] = "grid_world"
     presets: tuple[Literal["paper", "fast"], ...] = ("paper", "fast")
     cores: int = 1
     at_least: float = 0.3
@@ -120,11 +122,13 @@ def main() -> int:
     if args.quick:
         args = dataclasses.replace(args, repeats=1, at_least=0.0)
     matmuls = [time_matmul(*shape, args) for shape in (MERGE_MATMUL, LARGE_MATMUL)]
-    problems = {preset: _measure.load_problem(preset, **(_measure.QUICK if args.quick else {})) for preset in args.presets}
+    changes = _measure.QUICK if args.quick else {}
+    problems = {preset: _measure.load_problem(preset, space=args.space, **changes) for preset in args.presets}
     results = {preset: measure(problem, args) for preset, problem in problems.items()}
     rate = matmuls[0].rate
     text = "\n".join([matmul_table(matmuls), *(tables(preset, result, rate) for preset, result in results.items())])
-    _measure.report("training_step", args, {"matmuls": matmuls, "presets": results}, text)
+    name = "training_step" if args.space == "grid_world" else f"training_step_{args.space}"
+    _measure.report(name, args, {"matmuls": matmuls, "presets": results}, text)
     return 0
 
 
