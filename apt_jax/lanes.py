@@ -4,8 +4,8 @@ A lane is one (key, HParams).  The functions of `apt_jax.trainer` know nothing o
 devices, also those of other hosts, and jitted.  The program has no collectives, so no device ever waits for another (one CPU
 device that waits for another longer than a minute ends the process: XLA takes it for a deadlock).
 
-Within a device, lanes run side by side ("vmap", best on accelerators) or one after another ("map": on CPU its time per seed
-does not grow with their number, under "vmap" it does; BENCHMARKS.md, "Many seeds").
+Within a device, lanes run side by side ("vmap", for accelerators) or one after another ("map", for CPUs: with a device per core
+both take as long, and "map" computes in every lane what it computes alone; BENCHMARKS.md, "Many seeds").
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ def make_program(
 
     Args:
       layout: how the lanes of one device are laid out; "auto" is "map" on CPU and "vmap" elsewhere.
-      at_once: lanes of one device that "vmap" puts side by side, the others in turn, if not all fit its memory; all by default.
+      at_once: lanes of one device that "vmap" puts side by side, the others in turn, if not all fit its memory; all by default,
+        and without effect under "map".
       resident: lanes that one device's memory has room for; if there are more, groups of them take turns (`apt_jax.turns`), and
         states are kept by the host.  All fit by default.
       devices: what to shard lanes over, by default every device of every process; no more are used than there are lanes.

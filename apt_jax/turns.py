@@ -20,7 +20,8 @@ class Turns:
     """A function of G lanes made one of L: called for every G of them, one call after the other.
 
     Arguments and results have leaves [L, ...], but for the clock, which all lanes share.  Results are on the host's first CPU
-    device: at any time the devices hold no more than a group.
+    device: at any time the devices hold no more than a group.  The host holds three times all lanes at the end of a call: what
+    went in, the groups' results, and these joined.
 
     Attributes:
       function: jitted, of arrays with leaves [G, ...]; `lower` and `compile` do with it what they do with a jitted function.

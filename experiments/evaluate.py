@@ -28,8 +28,8 @@ class Args:
 
     Attributes:
       run_dir: a directory that experiments.train wrote.
-      target: a target's name, by default the one trained on.
-      target_file: a file that describes the target task, instead of a name.
+      target: a target's name, or a file that describes one; by default the one trained on.
+      target_file: a file that describes the target task, whatever `target` says.
       episodes: greedy episodes per lane.
       seed: of the episodes' initial states.
       gif: where to put a film of the best lane.
@@ -61,7 +61,9 @@ def evaluate(args: Args) -> None:
     if args.robot:
         film.check_robot(experiment.space)
     if args.target or args.target_file:
-        experiment = dataclasses.replace(experiment, target=args.target or experiment.target, target_file=args.target_file)
+        target = args.target or experiment.target
+        file = args.target_file or settings.target_path(experiment.space, target)
+        experiment = dataclasses.replace(experiment, target=target, target_file=file)
     problem = make_problem(experiment)
     keys, hparams = lane_inputs(experiment)
     here = Mesh(np.array(jax.devices()[:1]), ("lane",))

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+import envs
 from apt_jax.config import PRESETS, Config, HParams, check_hparams
 from apt_jax.lanes import Layout
 from experiments import lanes, run_dir
@@ -34,7 +35,7 @@ class Experiment:
     """What is computed; saved in the run directory, and what a resumed run has to agree with.
 
     Attributes:
-      space: the task space.
+      space: the task space: grid_world, manipulation, or manipulation_sawyer.
       target: the target task's name in the space, or a file that describes it.
       target_file: a file that describes the target task, whatever `target` says.
       seeds: one lane of the compiled program each, for every combination of swept hyper-parameters.
@@ -66,10 +67,13 @@ class Session:
     Attributes:
       run_dir: where everything is written; must be new, empty, or resumed.
       resume: go on from the run directory's checkpoint; the experiment defaults to what is saved there.
-      preset: the config and hparams to start from (paper, unless a run is resumed); other options override single fields.
-      method: short for --config.method.
+      preset: the config and hparams to start from (paper, unless a run is resumed), but for a gamma of the space's own; other
+        options override single fields.
+      method: short for --config.method: apt_gen, apt_gen_progress_only, apt_gen_return_only, random, alp_gmm, goal_gan, dqn,
+        icm, rnd, ride, or one with a bonus added as in "apt_gen+rnd".
       layout: how the lanes of one device are laid out.
-      at_once: lanes of a device side by side under layout vmap, the others in turn, if all do not fit its memory.
+      at_once: lanes of a device side by side under layout vmap, the others in turn, if all do not fit its memory; layout map,
+        the one of CPUs, has one at a time anyway.
       devices: devices the host CPU counts as, by default one per core; lanes are spread over them.
       distributed: this is one of several processes, each started with the same options, that share lanes and run directory; on
         SLURM, Open MPI, Kubernetes and TPU pods they find each other, elsewhere with the next three options.
@@ -150,12 +154,18 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
     experiment, session = tyro.cli(train, args=args, prog="python -m experiments.train", config=(tyro.conf.FlagCreatePairsOff,))
     if session.method:
         experiment = dataclasses.replace(experiment, config=dataclasses.replace(experiment.config, method=session.method))
-    if not experiment.target_file and Path(experiment.target).is_file():
-        experiment = dataclasses.replace(experiment, target_file=Path(experiment.target))
+    if not experiment.target_file:
+        experiment = dataclasses.replace(experiment, target_file=target_path(experiment.space, experiment.target))
     check(experiment, session)
     if saved:
         check_resumable(saved, experiment)
     return experiment, session
+
+
+def target_path(space: str, target: str) -> Path | None:
+    """The file that `target` is, if it is one and no target of the space has this name."""
+    named = space in envs.SPACES and target in envs.make(space).targets
+    return Path(target) if Path(target).is_file() and not named else None
 
 
 def check(experiment: Experiment, session: Session) -> None:

@@ -84,10 +84,10 @@ def row(
         str(seed),
         f"{np.nanmean(returns):.2f} ({low:.2f} to {high:.2f})",
         ", ".join(f"{share:.0%}" for share in bounds),
-        over_time(curves.get("probe_solution_length"), 1),
-        over_time(curves.get("probe_feasible"), 2),
-        over_time(curves.get("probe_entropy_tiles"), 2),
-        over_time(curves.get("probe_goal_distance"), 1),
+        over_time(env_steps, curves.get("probe_solution_length"), 1),
+        over_time(env_steps, curves.get("probe_feasible"), 2),
+        over_time(env_steps, curves.get("probe_entropy_tiles"), 2),
+        over_time(env_steps, curves.get("probe_goal_distance"), 1),
         *(f"{np.nanmean(curves[name][late]):.2f}" for name in ("v1_correlation", "v2_correlation")),
         f"{np.nanmean(curves['v2_bias'][late]):+.2f}",
         f"{np.nanmean((curves['generator_return'] - curves['generated_episode_return'])[late]):+.2f}",
@@ -95,11 +95,11 @@ def row(
     return f"| {' | '.join(cells)} |"
 
 
-def over_time(values: Float[np.ndarray, "T"] | None, digits: int) -> str:
-    """A curve at each quarter of its length."""
+def over_time(env_steps: Int[np.ndarray, "T"], values: Float[np.ndarray, "T"] | None, digits: int) -> str:
+    """A curve at each quarter of the steps."""
     if values is None:
         return "-"
-    windows = [values[max(0, end - 5) : end] for end in (len(values) * quarter // 4 for quarter in (1, 2, 3, 4))]
+    windows = [values[env_steps * 4 <= env_steps[-1] * quarter][-5:] for quarter in (1, 2, 3, 4)]
     means = [np.mean(window[np.isfinite(window)]) if np.isfinite(window).any() else np.nan for window in windows]
     return " ".join(f"{mean:.{digits}f}" for mean in means)
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import envs
 from apt_jax.config import Config, HParams
 from apt_jax.trainer import make_trainer
 from experiments.benchmarks import _flops, _measure, dqn_peers, environments, growth, training_step, training_throughput
@@ -132,7 +133,9 @@ def test_numbers_in_tables(value, text):
 
 def test_each_preset_fits_the_quick_sizes():
     for preset in training_step.Args().presets:
-        _measure.load_problem(preset, **_measure.QUICK)
+        for name in envs.SPACES:
+            space, target, config, _ = _measure.load_problem(preset, space=name, **_measure.QUICK)
+            make_trainer(space, target, config)
 
 
 COUNTDOWN = JaxWorld(

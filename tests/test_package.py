@@ -121,3 +121,23 @@ def test_planted_constant_that_starts_a_backend_is_found(tmp_path):
 @pytest.mark.parametrize("name", ["LICENSE", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md"])
 def test_repository_keeps(name):
     assert (ROOT / name).stat().st_size > 0
+
+
+def test_type_checker_reports_a_planted_fault(tmp_path):
+    """The configuration of `make lint` is strict enough to see it."""
+    (tmp_path / "planted.py").write_text(
+        "def size(name: str) -> int:\n    return name\n\n\ndef untyped(name):\n    return name\n"
+    )
+    words = [
+        "-m",
+        "mypy",
+        "--config-file",
+        "pyproject.toml",
+        "--cache-dir",
+        str(tmp_path / "cache"),
+        str(tmp_path / "planted.py"),
+    ]
+    result = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert "[return-value]" in result.stdout
+    assert "[no-untyped-def]" in result.stdout

@@ -16,7 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import envs
 from apt_jax.config import PRESETS, Config, HParams
+from apt_jax.methods import METHODS
 from experiments import evaluate, run_dir, settings, sinks, train
 from experiments.errors import UsageError
 from experiments.problem import make_problem
@@ -83,12 +85,27 @@ def test_options_override_the_preset(tmp_path):
     assert experiment.hparams == hparams.replace(delta=0.3)
 
 
-def test_a_space_may_have_a_discount_of_its_own(tmp_path):
-    words = ["--run-dir", str(tmp_path), "--preset", "fast", "--space", "manipulation"]
+@pytest.mark.parametrize("space", ["manipulation", "manipulation_sawyer"])
+def test_a_space_may_have_a_discount_of_its_own(tmp_path, space):
+    words = ["--run-dir", str(tmp_path), "--preset", "fast", "--space", space]
     experiment, _ = settings.parse(words)
     assert experiment.hparams == PRESETS["fast"][1].replace(gamma=settings.GAMMA["manipulation"])
     experiment, _ = settings.parse([*words, "--hparams.gamma", "0.9"])
     assert experiment.hparams.gamma == 0.9
+
+
+def test_a_file_does_not_hide_a_target_of_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("A", "mine"):
+        Path(name).write_text("")
+    assert settings.target_path("grid_world", "A") is None
+    assert settings.target_path("grid_world", "mine") == Path("mine")
+    assert settings.target_path("grid_world", "yours") is None
+
+
+def test_help_names_every_space_and_method():
+    text = f"{settings.Experiment.__doc__} {settings.Session.__doc__}"
+    assert all(name in text for name in (*envs.SPACES, *METHODS))
 
 
 def test_several_values_are_a_sweep_over_every_seed(tmp_path):

@@ -42,8 +42,9 @@ CONFIG = Config(
     alp_fit_every=20,
     goal_tasks=8,
 )
-SWITCHES = {"relative_progress": True, "blank_bias": 2.0, "success_share": 0.5, "value_ensemble": 2}
-"""What preset "fast" has beyond the paper."""
+PAPER, FAST = (dataclasses.asdict(PRESETS[preset][0]) for preset in ("paper", "fast"))
+SWITCHES = {name: FAST[name] for name in FAST if FAST[name] != PAPER[name] == getattr(CONFIG, name)}
+"""What preset "fast" does otherwise than the paper, beyond the sizes that are made small here."""
 
 
 def config(method: str, **changes) -> Config:
@@ -139,12 +140,13 @@ def test_diversity_sees_a_collapse_of_one_modality():
 
 @pytest.mark.parametrize("layout", ["map", "vmap"])
 def test_a_seed_alone_equals_the_same_seed_among_others(layout):
-    """Float reassociation is the only difference allowed; on two devices three lanes also exercise the padding."""
-    several, _, history = run(config("apt_gen"), [3, 4, 5], layout=layout)
+    """Float reassociation is the only difference allowed; on two devices five lanes also exercise the padding."""
+    cfg, seeds = config("apt_gen", **SWITCHES), [3, 4, 5, 6, 7]
+    several, _, history = run(cfg, seeds, layout=layout)
     # Metrics stay on the devices of their lanes: to bring them together, devices would have to wait for each other.
     assert all(value.sharding.spec == PartitionSpec("lane") for value in history[0].values())
-    for lane, seed in enumerate([3, 4, 5]):
-        alone, _, _ = run(config("apt_gen"), [seed])
+    for lane, seed in enumerate(seeds):
+        alone, _, _ = run(cfg, [seed])
         assert_lane_equal(several, lane, alone)
 
 

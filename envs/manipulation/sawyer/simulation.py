@@ -34,12 +34,13 @@ def sawyer(place: Float[Array, "2"], ahead: Float[Array, "2"]) -> Drive:
     """
     seen, seen_ahead = mirror_places(place), jnp.stack([-ahead[0], ahead[1]])
     joints = course(seen, seen_ahead)
+    joints = jnp.concatenate([joints, joints[-1:]])  # where it stands still
     speeds = jnp.diff(joints, axis=0, prepend=joints[:1], append=joints[-1:]) / TIMESTEP
     accelerations = jnp.diff(speeds, axis=0) / TIMESTEP
     scene = standing(arm_scene(), seen, seen_ahead)
 
     def advance(motion: Motion, supported: Supported) -> Motion:
-        now = jnp.minimum(motion.steps, STEPS)
+        now = jnp.minimum(motion.steps, STEPS + 1)
         off, speed_off = joints[now] - motion.qpos[-JOINTS:], speeds[now] - motion.qvel[-JOINTS:]
         data = scene.data.replace(ctrl=wanted(off, speed_off, accelerations[now], RATE))
         return take_step(scene._replace(data=data), motion, supported)
