@@ -55,7 +55,7 @@ class Runner:
     @property
     def placement(self) -> str:
         """How large the lanes are, and where they are if not all fit the devices."""
-        size = f"{self._lanes} lanes of {lane_bytes(self._trainer) / 2**20:.1f} MiB"
+        size = f"{self._lanes} lane{'s' * (self._lanes > 1)} of {lane_bytes(self._trainer) / 2**20:.1f} MiB"
         if not isinstance(self._program.chunk, Turns):
             return size
         group = self._program.chunk.group
