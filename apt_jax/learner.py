@@ -71,7 +71,7 @@ def epsilon_schedule(steps: Int[Array, ""], hparams: HParams) -> Float[Array, ""
 def epsilon_ladder(epsilon: Float[Array, ""], envs: int, hparams: HParams) -> Float[Array, "envs"]:
     """Each environment's epsilon, from `epsilon / epsilon_spread` to `epsilon * epsilon_spread` (which may be above 1).
 
-    A policy finds what random actions rarely reach where it explores much, and finishes long solutions where it explores little.
+    Much exploration finds what a greedy policy passes by; with little, a long solution comes to its end.
     """
     rung = (2 * jnp.arange(envs, dtype=jnp.float32) - (envs - 1)) / max(envs - 1, 1)
     return epsilon * hparams.epsilon_spread**rung
