@@ -24,8 +24,6 @@ class HParams:
       epsilon_start: exploration right after warm-up, in [0, 1].
       epsilon_end: exploration in the long run, in [0, 1].
       epsilon_steps: environment steps over which epsilon falls linearly, > 0.
-      epsilon_spread: what epsilon is multiplied with in one environment of a source and divided by in another, geometrically
-        spaced in those between, >= 1 (paper: 1; different epsilons side by side are Ape-X's).
       delta: wanted return of generated tasks (paper: 0.5).
       tolerance: band around `delta` in which beta stays (paper: 0.1).
       beta_init: beta at the start.
@@ -61,7 +59,6 @@ class HParams:
     epsilon_start: float = 1.0
     epsilon_end: float = 0.1
     epsilon_steps: float = 1_000.0
-    epsilon_spread: float = 1.0
     delta: float = 0.5
     tolerance: float = 0.1
     beta_init: float = 1.0
@@ -111,7 +108,6 @@ def check_hparams(hparams: HParams) -> None:
         **dict.fromkeys(positive, (math.ulp(0.0), math.inf, "above 0")),
         **dict.fromkeys(not_negative + rates + scales, (0.0, math.inf, "at least 0")),
         **dict.fromkeys(shares, (0.0, 1.0, "in [0, 1]")),
-        "epsilon_spread": (1.0, math.inf, "at least 1"),
     }
     for name, (low, high, allowed) in ranges.items():
         value = getattr(hparams, name)

@@ -68,15 +68,6 @@ def epsilon_schedule(steps: Int[Array, ""], hparams: HParams) -> Float[Array, ""
     return hparams.epsilon_start + fraction * (hparams.epsilon_end - hparams.epsilon_start)
 
 
-def epsilon_ladder(epsilon: Float[Array, ""], envs: int, hparams: HParams) -> Float[Array, "envs"]:
-    """Each environment's epsilon, from `epsilon / epsilon_spread` to `epsilon * epsilon_spread` (which may be above 1).
-
-    Much exploration finds what a greedy policy passes by; with little, a long solution comes to its end.
-    """
-    rung = (2 * jnp.arange(envs, dtype=jnp.float32) - (envs - 1)) / max(envs - 1, 1)
-    return epsilon * hparams.epsilon_spread**rung
-
-
 def update(
     network: QNetwork,
     state: LearnerState,

@@ -127,7 +127,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         )
 
     def collect(
-        state: TrainState, clock: Clock, key: Key[Array, ""], epsilon: Float[Array, "E"] | float, hparams: HParams
+        state: TrainState, clock: Clock, key: Key[Array, ""], epsilon: Float[Array, ""] | float, hparams: HParams
     ) -> TrainState:
         """Act, step and write: one step of every environment.  All writes come before any read of the rings."""
         key_act, key_assign, key_step = jax.random.split(key, 3)
@@ -182,8 +182,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         state, clock = carry
         key, key_collect, key_learn, key_adapt = jax.random.split(state.key, 4)
         epsilon = learner.epsilon_schedule(clock.env_steps - config.warmup_steps, hparams)
-        ladder = learner.epsilon_ladder(epsilon, envs, hparams)
-        state = collect(state._replace(key=key), clock, key_collect, ladder, hparams)
+        state = collect(state._replace(key=key), clock, key_collect, epsilon, hparams)
         state, learner_metrics = learn(state, clock, key_learn, hparams)
         state, curriculum_metrics = adapt(state, clock, key_adapt, hparams)
         return (state, tick(clock)), {"epsilon": epsilon, **learner_metrics, **curriculum_metrics}

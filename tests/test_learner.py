@@ -69,13 +69,6 @@ def test_epsilon_falls_linearly_then_stays():
     np.testing.assert_allclose(values, [1.0, 1.0, 0.55, 0.1, 0.1], rtol=1e-6)
 
 
-def test_environments_explore_by_a_geometric_ladder():
-    ladder = learner.epsilon_ladder(jnp.float32(0.1), 5, HParams(epsilon_spread=4.0))
-    np.testing.assert_allclose(ladder, [0.025, 0.05, 0.1, 0.2, 0.4], rtol=1e-6)
-    np.testing.assert_array_equal(learner.epsilon_ladder(jnp.float32(0.1), 5, HParams()), np.full(5, 0.1, np.float32))
-    np.testing.assert_allclose(learner.epsilon_ladder(jnp.float32(0.1), 1, HParams(epsilon_spread=4.0)), [0.1], rtol=1e-6)
-
-
 def test_epsilon_greedy_explores_uniformly_in_its_share():
     params = learner.init(NETWORK, jax.random.key(0)).params
     obs = {"x": jnp.broadcast_to(jnp.array([0.3, -0.2, 0.9]), (20_000, 3))}
