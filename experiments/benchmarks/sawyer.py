@@ -29,7 +29,7 @@ from experiments.errors import exit_with
 
 @dataclass(frozen=True)
 class Args(Options):
-    """Random pushes on uniformly random tables, by the tool alone and by the arm.
+    """Random pushes on uniformly random tables, by the tool alone and by the arm; each once, whatever `repeats` says.
 
     Attributes:
       pushes: how many.
