@@ -57,7 +57,10 @@ def film(args: Args) -> None:
     """Writes a film of a shortest solution: the known one of a named target, else one that is searched for."""
     if not args.out.parent.is_dir():
         raise UsageError(f"{args.out.parent} is no directory")
-    space = Space()
+    try:
+        space = Space()
+    except ValueError as error:
+        raise UsageError(str(error)) from error
     task = load_target(space.name, args.target, args.target_file)
     actions = solve(task, space.goal_jitter) if args.target_file else DEMONSTRATIONS[args.target]
     if actions is None:

@@ -164,8 +164,9 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
 
 def target_path(space: str, target: str) -> Path | None:
     """The file that `target` is, if it is one and no target of the space has this name."""
-    named = space in envs.SPACES and target in envs.make(space).targets
-    return Path(target) if Path(target).is_file() and not named else None
+    if not Path(target).is_file() or (space in envs.SPACES and target in envs.make(space).targets):
+        return None
+    return Path(target)
 
 
 def check(experiment: Experiment, session: Session) -> None:

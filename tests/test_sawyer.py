@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes.util
 import itertools
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ import pytest
 from PIL import Image
 
 import envs
-from envs.manipulation import table_scene
+from envs.manipulation import Space, table_scene
 from envs.manipulation.push import TOOL_START, stroke
 from envs.manipulation.sawyer import camera, motion, replay, stage
 from envs.manipulation.sawyer.arm import BASE, FLANGE, LINKS, STICK
@@ -271,6 +272,13 @@ class TestFilm:
         film.film(film.Args(tmp_path / "film.gif", target="A"))
         assert gif_frames(tmp_path / "film.gif") == (len(DEMONSTRATIONS["A"]) + 1, (192, 128))
         assert "libegl1" in capsys.readouterr().err
+
+    def test_a_missing_backend_is_told_before_anything_else(self, monkeypatch):
+        """MuJoCo then fails to be imported; None in its place makes it fail wherever the libraries are."""
+        monkeypatch.setenv("MUJOCO_GL", "osmesa")
+        monkeypatch.setitem(sys.modules, "mujoco", None)
+        with pytest.raises(ValueError, match=r"MUJOCO_GL=osmesa names a library that does not load.* or unset MUJOCO_GL"):
+            Space()
 
     def test_a_backend_that_has_a_window_is_refused(self, monkeypatch):
         monkeypatch.setenv("MUJOCO_GL", "glfw")

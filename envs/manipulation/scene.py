@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import os
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
@@ -122,6 +123,24 @@ def push_xml(*, with_tool: bool = True) -> str:
   </worldbody>
   <contact>{"".join(pairs)}</contact>
 </mujoco>"""
+
+
+def check_drawing() -> None:
+    """Checks that MuJoCo can be imported, which it cannot if `MUJOCO_GL` names a library that is missing.
+
+    Raises:
+      ValueError: what to install, or to unset.
+    """
+    named = os.environ.get("MUJOCO_GL")
+    if named not in ("egl", "osmesa"):
+        return
+    try:
+        import mujoco  # noqa: F401
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"MUJOCO_GL={named} names a library that does not load ({error}): install it (Debian and Ubuntu: libegl1 "
+            "libopengl0, or libosmesa6) or unset MUJOCO_GL; only drawing the robot needs one"
+        ) from error
 
 
 @functools.cache

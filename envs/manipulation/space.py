@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, Key, UInt8
 
 from apt_jax.specs import Obs, Params, Spec, Vector, param_struct
 from apt_jax.task_space import StepOutput
-from envs.manipulation import arms, dynamics
+from envs.manipulation import arms, dynamics, scene
 from envs.manipulation.dynamics import HORIZON, State
 from envs.manipulation.layout import parse_table
 from envs.manipulation.observation import OBS_SPEC, observe
@@ -27,7 +27,10 @@ class Space:
     Attributes:
       targets: text of each target task by name, for `parse_target`.
       goal_jitter: metres along x and y within which an episode's goal is drawn about the task's, in all tasks alike.
-      arm: what pushes the cans, a name of `arms.ARMS`; the constructor raises ValueError on a wrong one.
+      arm: what pushes the cans, a name of `arms.ARMS`.
+
+    Raises:
+      ValueError: a wrong name of an arm, or `MUJOCO_GL` names a library that is missing.
     """
 
     name: str = "manipulation"
@@ -38,6 +41,7 @@ class Space:
     targets: Mapping[str, str] = TARGETS
 
     def __init__(self, goal_jitter: float = 0.03, arm: str = "tool"):
+        scene.check_drawing()
         self.goal_jitter, self.arm = goal_jitter, arm
         self.name = Space.name if arm == "tool" else f"{Space.name}_{arm}"
         self._arm = arms.arm(arm)
