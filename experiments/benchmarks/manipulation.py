@@ -52,8 +52,8 @@ class Args(Options):
 
 @dataclass(frozen=True)
 class Side:
-    """Environments side by side: the time of one push of all of them, and the process's largest resident size after it, in
-    bytes.
+    """Environments side by side: the time of one push of all of them, and the largest resident size of its process, in bytes,
+    compilation included.
     """
 
     timing: Timing
@@ -65,11 +65,11 @@ def main() -> int:
     args = tyro.cli(Args, prog="python -m experiments.benchmarks.manipulation")
     _measure.check(args)
     _measure.pin(args.cores)
-    # No compilation cache: the seconds to compile are results too.
-    jax.config.update("jax_num_cpu_devices", 1)
     if args.quick:
         args = dataclasses.replace(args, repeats=1, envs=args.envs[:2], at_least=0.0, checked=64, true_pushes=2)
-    sides = {n: time_pushes(n, args) for n in args.envs}
+    # Each in a process of its own, for its memory; without compilation cache, because the seconds to compile are results too.
+    sides = {n: _measure.in_new_process(time_pushes, n, args) for n in args.envs}
+    jax.config.update("jax_num_cpu_devices", 1)
     same, true = time_same_model(args), time_true_shapes(args)
     faults = count_faults(args.space, args.checked)
     rows = [
@@ -81,8 +81,8 @@ def main() -> int:
     header = ["pushes", "per second", "minutes per 100,000", "compile, s", "peak memory, MiB"]
     text = f"{_measure.table(header, rows)}\n{faults} of {args.checked:,} random pushes gave what is not a number.\n"
     results = {"side_by_side": sides, "same_model": same, "true_shapes": true, "faults": faults}
-    _measure.report("manipulation", args, results, text)
-    return 0
+    _measure.report(args.space, args, results, text)
+    return int(faults > 0)
 
 
 def random_pushes(key: Key[Array, ""], n: int) -> tuple[Any, Any, Array]:
@@ -102,6 +102,7 @@ def random_pushes(key: Key[Array, ""], n: int) -> tuple[Any, Any, Array]:
 
 def time_pushes(n: int, args: Args) -> Side:
     """Environments that start a new random task with every push, so that none is over before the others begin."""
+    jax.config.update("jax_num_cpu_devices", 1)
     step = jax.vmap(envs.make(args.space).step)
 
     def push(carry: tuple[Key[Array, ""], Float[Array, ""]], _: None) -> tuple[Key[Array, ""], Float[Array, ""]]:
