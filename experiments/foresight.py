@@ -163,8 +163,9 @@ def table(names: list[str], periods: Foresight) -> str:
     lines = [f"| {' | '.join(HEADER)} |", "|---" * len(HEADER) + "|"]
     for lane, name in enumerate(names):
         of_lane = Foresight(*(values[:, lane] for values in periods))
-        any_played = of_lane.played > 0
-        over_tasks = (np.average(x[any_played], weights=of_lane.played[any_played]) for x in of_lane[1:4])
+        # A period without a fresh task has no mean.
+        totals = (np.sum(np.where(of_lane.played > 0, x * of_lane.played, 0.0)) for x in of_lane[1:4])
+        over_tasks = (total / max(of_lane.played.sum(), 1.0) if of_lane.played.any() else np.nan for total in totals)
         values = (*over_tasks, of_lane.averaged.mean(), of_lane.online.mean())
         lines.append(f"| {name} | {of_lane.played.sum():.0f} | {' | '.join(f'{value:.2f}' for value in values)} |")
     return "\n".join(lines)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from experiments import run_dir
 from experiments.errors import UsageError, exit_with
@@ -25,11 +25,8 @@ HEADER = (
     "V1's correlation",
     "V2's correlation",
     "V2's bias, policy frozen",
-    "V2's bias, policy learning (falling, still, rising)",
+    "V2's bias, policy learning (root mean square)",
 )
-
-PERIOD = 5_000
-"""Environment steps over which the generated return falls or rises."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +36,7 @@ class Signs:
     What changes over training is shown at each quarter of it, as the mean of the five evaluations up to there.
     V2's bias is taken twice: of its estimate of fresh tasks less their return under the policy frozen as it is at the
     evaluation, and of what the generator believes it earns (V2 of its proposals, before exploration and less `pessimism`) less
-    what generated episodes do return, in which the policy goes on learning; of this one also the means of evaluations at which
-    that return had fallen by more than 0.1 within 5,000 steps, had changed less, and had risen by more.
+    what generated episodes do return, in which the policy goes on learning.
 
     Attributes:
       runs: directories of runs with a generator; a run is called by its directory's name.
@@ -94,24 +90,15 @@ def row(
         over_time(env_steps, curves.get("probe_goal_distance"), 1),
         *(f"{np.nanmean(curves[name][late]):.2f}" for name in ("v1_correlation", "v2_correlation")),
         f"{np.nanmean(curves['v2_bias'][late]):+.2f}",
-        by_trend(env_steps, curves["generator_return"], curves["generated_episode_return"], late),
+        error(curves["generator_return"][late], returns),
     )
     return f"| {' | '.join(cells)} |"
 
 
-def by_trend(
-    env_steps: Int[np.ndarray, "T"],
-    expected: Float[np.ndarray, "T"],
-    returned: Float[np.ndarray, "T"],
-    late: Bool[np.ndarray, "T"],
-) -> str:
-    """Mean of what was expected less what was returned: where the return was falling, was still, was rising."""
-    earlier = np.searchsorted(env_steps, env_steps - PERIOD, side="right") - 1
-    change = np.where(earlier >= 0, returned - returned[earlier], np.nan)
-    bias = expected - returned
-    trends = (change < -0.1, np.abs(change) <= 0.1, change > 0.1)
-    means = (f"{np.mean(part):+.2f}" if (part := bias[late & trend & np.isfinite(bias)]).size else "-" for trend in trends)
-    return f"{np.nanmean(bias[late]):+.2f} ({', '.join(means)})"
+def error(expected: Float[np.ndarray, "T"], returned: Float[np.ndarray, "T"]) -> str:
+    """Mean of what was expected less what was returned, and the root of its mean square."""
+    difference = expected - returned
+    return f"{np.nanmean(difference):+.2f} ({np.sqrt(np.nanmean(difference**2)):.2f})"
 
 
 def over_time(env_steps: Int[np.ndarray, "T"], values: Float[np.ndarray, "T"] | None, digits: int) -> str:

@@ -28,6 +28,8 @@ def test_periods_weigh_by_the_tasks_played():
     line = np.array([[0.2, 0.4], [0.4, 0.4]])
     seen = foresight.Foresight(played, value, value, value, line, line)
     rows = foresight.table(["seed 0", "seed 1"], seen).splitlines()[2:]
+    nothing = foresight.Foresight(0 * played, value, value, value, line, line)
+    assert foresight.table(["seed 0"], nothing).splitlines()[2] == "| seed 0 | 0 | nan | nan | nan | 0.30 | 0.30 |"
     assert rows == ["| seed 0 | 4 | 0.75 | 0.75 | 0.75 | 0.30 | 0.30 |", "| seed 1 | 2 | 0.50 | 0.50 | 0.50 | 0.40 | 0.40 |"]
 
 

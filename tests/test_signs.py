@@ -27,13 +27,8 @@ def test_a_row_averages_what_lies_after_the_given_step():
         "generator_return": np.where(late, 0.25, 9.0),
     }
     row = signs.row("run", 3, env_steps, curves, 4_000, {"beta_min": 0.125, "beta_max": 8.0})
-    assert row == "| run | 3 | 0.50 (0.50 to 0.50) | 50%, 25% | - | - | - | - | 0.25 | -0.50 | +0.10 | -0.25 (-, -, -0.25) |"
+    assert row == "| run | 3 | 0.50 (0.50 to 0.50) | 50%, 25% | - | - | - | - | 0.25 | -0.50 | +0.10 | -0.25 (0.25) |"
 
 
-def test_bias_by_trend_of_the_return():
-    env_steps = np.arange(1, 9) * 2_500
-    returned = np.array([0.5, 0.5, 0.5, 0.1, 0.1, 0.15, 0.9, 0.9])
-    expected = np.array([0.0, 0.0, 0.6, 0.4, 0.2, 0.15, 0.8, 0.6])
-    # Against two evaluations before, from the third on: falls at the fourth and fifth, rises at the last two.
-    cell = signs.by_trend(env_steps, expected, returned, np.arange(8) >= 2)
-    assert cell == "+0.02 (+0.20, +0.05, -0.20)"
+def test_error_has_a_mean_and_a_size_and_skips_gaps():
+    assert signs.error(np.array([0.5, 0.5, 9.0]), np.array([0.2, 0.6, np.nan])) == "+0.10 (0.22)"
