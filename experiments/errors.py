@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 
 class UsageError(Exception):
     """A request that cannot be fulfilled as given; the message says why and what would be."""
+
+
+def check_folder(file: Path | None) -> None:
+    """Raises a `UsageError` unless there is the directory that `file` is to be written to: before the work, not after it."""
+    if file and not file.parent.is_dir():
+        raise UsageError(f"{file.parent} is no directory")
 
 
 def exit_with(main: Callable[[], int]) -> None:

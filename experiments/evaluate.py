@@ -16,7 +16,7 @@ from rich.table import Table
 
 from apt_jax.evaluation import Outcome
 from experiments import episodes, film, runtime, settings
-from experiments.errors import UsageError, exit_with
+from experiments.errors import UsageError, check_folder, exit_with
 from experiments.problem import make_problem
 from experiments.run_dir import RunDir
 from experiments.runner import lane_inputs, load_states
@@ -57,6 +57,7 @@ def evaluate(args: Args) -> None:
     """Prints return and success of every lane."""
     if args.episodes < 1:
         raise UsageError(f"--episodes must be at least 1, got {args.episodes}")
+    check_folder(args.gif)
     experiment = settings.load(args.run_dir)
     if args.robot:
         film.check_robot(experiment.space)

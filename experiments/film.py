@@ -19,7 +19,7 @@ from envs.manipulation.solver import solve
 from envs.manipulation.targets import DEMONSTRATIONS
 from experiments import episodes, runtime
 from experiments.episodes import Episode
-from experiments.errors import UsageError, exit_with
+from experiments.errors import UsageError, check_folder, exit_with
 from experiments.problem import load_target
 
 FPS = 2.0
@@ -55,8 +55,7 @@ def main() -> int:
 
 def film(args: Args) -> None:
     """Writes a film of a shortest solution: the known one of a named target, else one that is searched for."""
-    if not args.out.parent.is_dir():
-        raise UsageError(f"{args.out.parent} is no directory")
+    check_folder(args.out)
     try:
         space = Space()
     except ValueError as error:

@@ -24,6 +24,8 @@ class Problem(NamedTuple):
 
 def load_target(space: str, name: str, file: Path | None) -> Any:
     """The target task of a file, if one is given, else of a name; raises a `UsageError` if there is none."""
+    if not file and Path(name).suffix:
+        raise UsageError(f"--target {name} is no file")
     try:
         return envs.load_target_file(space, file) if file else envs.load_target(space, name)
     except (ValueError, OSError) as error:

@@ -10,7 +10,7 @@ import tyro
 
 import envs
 from experiments import plots, runtime
-from experiments.errors import UsageError, exit_with
+from experiments.errors import UsageError, check_folder, exit_with
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,7 @@ def main() -> int:
     args = tyro.cli(Args, prog="python -m experiments.random_tasks")
     if min(args.rows, args.columns) < 1:
         raise UsageError(f"--rows and --columns must be at least 1, got {args.rows} and {args.columns}")
+    check_folder(args.out)
     runtime.setup()
     try:
         space = envs.make(args.space)

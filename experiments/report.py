@@ -43,6 +43,8 @@ class Report:
 def main() -> int:
     """The command line."""
     report = tyro.cli(Report, prog="python -m experiments.report", description=__doc__)
+    if not report.runs:
+        raise UsageError("--runs needs at least one directory")
     runs = read(report.runs)
     print(table(runs))
     if report.figure:

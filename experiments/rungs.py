@@ -28,7 +28,7 @@ from apt_jax.networks import QNetwork, spectral_normalize
 from apt_jax.specs import Obs, Params
 from apt_jax.trainer import Trainer, TrainState
 from experiments import run_dir, runtime, settings
-from experiments.errors import UsageError, exit_with
+from experiments.errors import UsageError, check_folder, exit_with
 from experiments.ladder import Ladder, build
 from experiments.problem import make_problem
 from experiments.runner import lane_inputs, load_states
@@ -75,6 +75,7 @@ class Judgement(NamedTuple):
 def main() -> int:
     """The command line."""
     args = tyro.cli(Args, prog="python -m experiments.rungs", description=__doc__)
+    check_folder(args.figure)
     runtime.setup()
     if args.tasks < 1:
         raise UsageError(f"--tasks must be at least 1, got {args.tasks}")

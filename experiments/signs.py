@@ -50,8 +50,9 @@ class Signs:
 def main() -> int:
     """The command line."""
     signs = tyro.cli(Signs, prog="python -m experiments.signs", description=__doc__)
-    print(f"| {' | '.join(HEADER)} |")
-    print("|---" * len(HEADER) + "|")
+    if not signs.runs:
+        raise UsageError("--runs needs at least one directory")
+    rows = []
     for path in signs.runs:
         config = run_dir.read_config(path)
         env_steps, curves = run_dir.read_metrics(path)
@@ -61,7 +62,8 @@ def main() -> int:
             raise UsageError(f"--after must be below the {env_steps[-1]:,} steps of {path}, got {signs.after:,}")
         for lane, seed in enumerate(config["seeds"]):
             seed_curves = {name: values[lane] for name, values in curves.items()}
-            print(row(path.name, seed, env_steps, seed_curves, signs.after, config["hparams"]))
+            rows.append(row(path.name, seed, env_steps, seed_curves, signs.after, config["hparams"]))
+    print("\n".join((f"| {' | '.join(HEADER)} |", "|---" * len(HEADER) + "|", *rows)))
     return 0
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
+import sys
 
-from experiments import signs
+import numpy as np
+import pytest
+
+from experiments import report, signs
+from experiments.errors import UsageError, check_folder
 
 
 def test_over_time_takes_the_mean_of_the_five_values_up_to_each_quarter_and_skips_gaps():
@@ -32,3 +36,17 @@ def test_a_row_averages_what_lies_after_the_given_step():
 
 def test_error_has_a_mean_and_a_size_and_skips_gaps():
     assert signs.error(np.array([0.5, 0.5, 9.0]), np.array([0.2, 0.6, np.nan])) == "+0.10 (0.22)"
+
+
+@pytest.mark.parametrize("module", [signs, report])
+def test_no_run_is_a_mistake(module, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["module", "--runs"])
+    with pytest.raises(UsageError, match="--runs needs at least one directory"):
+        module.main()
+
+
+def test_a_missing_folder_is_told(tmp_path):
+    check_folder(None)
+    check_folder(tmp_path / "new.png")
+    with pytest.raises(UsageError, match="nowhere is no directory"):
+        check_folder(tmp_path / "nowhere" / "new.png")
