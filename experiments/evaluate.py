@@ -10,7 +10,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import tyro
-from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
 
@@ -18,8 +17,7 @@ from apt_jax.evaluation import Outcome
 from experiments import episodes, film, runtime, settings
 from experiments.errors import UsageError, check_folder, exit_with
 from experiments.problem import make_problem
-from experiments.run_dir import RunDir
-from experiments.runner import lane_inputs, load_states
+from experiments.runner import load_lanes
 
 
 @dataclass(frozen=True)
@@ -66,10 +64,8 @@ def evaluate(args: Args) -> None:
         file = args.target_file or settings.target_path(experiment.space, target)
         experiment = dataclasses.replace(experiment, target=target, target_file=file)
     problem = make_problem(experiment)
-    keys, hparams = lane_inputs(experiment)
-    here = Mesh(np.array(jax.devices()[:1]), ("lane",))
-    states, clock = load_states(RunDir(args.run_dir).checkpoints, problem.trainer, keys, hparams, here)
-    policies = jax.tree.map(lambda x: x[: len(experiment.lanes)], states.learner.target_params)
+    states, clock, _ = load_lanes(args.run_dir, experiment, problem.trainer)
+    policies = states.learner.target_params
     key_score, key_film = jax.random.split(jax.random.key(args.seed))
     outcome = episodes.score(problem.trainer, policies, problem.target, episodes=args.episodes, key=key_score)
     names = [lane.name for lane in experiment.lanes]

@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from apt_jax import evaluation, learner
@@ -29,10 +28,10 @@ from apt_jax.networks import QNetwork
 from apt_jax.replay import Episode, Replay
 from apt_jax.specs import Obs
 from apt_jax.trainer import Clock, Trainer, TrainState
-from experiments import run_dir, runtime, settings
+from experiments import runtime, settings
 from experiments.errors import UsageError, exit_with
 from experiments.problem import make_problem
-from experiments.runner import lane_inputs, load_states
+from experiments.runner import load_lanes
 
 HEADER = (
     "lane",
@@ -93,12 +92,9 @@ def main() -> int:
     if not experiment.config.method.startswith("apt_gen"):
         raise UsageError(f"{args.run_dir} is no run of apt_gen but of {experiment.config.method}")
     trainer = make_problem(experiment).trainer
-    keys, hparams = lane_inputs(experiment)
-    here = Mesh(np.array(jax.devices()[:1]), ("lane",))
-    states, clock = load_states(run_dir.RunDir(args.run_dir).checkpoints, trainer, keys, hparams, here)
+    states, clock, hparams = load_lanes(args.run_dir, experiment, trainer)
     names = [lane.name for lane in experiment.lanes]
     print(f"{args.run_dir} after {int(clock.env_steps):,} steps; {args.periods} periods of {trainer.config.eval_every:,}\n")
-    states = jax.tree.map(lambda x: x[: len(names)], states)
     periods = []
     for key in jax.random.split(jax.random.key(args.seed), args.periods):
         states, clock, seen = period(trainer, states, clock, hparams, args.tasks, key)

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, Key
 from matplotlib.figure import Figure
 from scipy import stats
@@ -27,11 +26,11 @@ from apt_jax.curricula.apt_gen_objectives import make_objectives
 from apt_jax.networks import QNetwork, spectral_normalize
 from apt_jax.specs import Obs, Params
 from apt_jax.trainer import Trainer, TrainState
-from experiments import run_dir, runtime, settings
+from experiments import runtime, settings
 from experiments.errors import UsageError, check_folder, exit_with
 from experiments.ladder import Ladder, build
 from experiments.problem import make_problem
-from experiments.runner import lane_inputs, load_states
+from experiments.runner import load_lanes
 
 STEPS_SEEN = 16
 """Transitions of each rollout that its logit is taken from."""
@@ -86,12 +85,8 @@ def main() -> int:
         )
     problem = make_problem(experiment)
     ladder = build(problem.target)
-    here = Mesh(np.array(jax.devices()[:1]), ("lane",))
-    checkpoints = run_dir.RunDir(args.run_dir).checkpoints
-    keys, hparams = lane_inputs(experiment)
-    states, clock = load_states(checkpoints, problem.trainer, keys, hparams, here)
+    states, clock, hparams = load_lanes(args.run_dir, experiment, problem.trainer)
     lanes = len(experiment.lanes)
-    states = jax.tree.map(lambda x: x[:lanes], states)
     judged = judge(problem.trainer, states, hparams, choose(ladder, args.tasks, args.seed), jax.random.key(args.seed))
     judged = jax.tree.map(lambda x: np.asarray(x).reshape(lanes, len(ladder.steps), args.tasks), judged)
     print(f"{args.run_dir} after {int(clock.env_steps):,} steps; means over lanes and tasks\n")

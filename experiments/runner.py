@@ -21,6 +21,7 @@ from apt_jax.trainer import Clock, Trainer, TrainState
 from apt_jax.turns import Turns
 from experiments import processes, runtime
 from experiments.errors import UsageError
+from experiments.run_dir import RunDir
 from experiments.settings import Experiment
 
 _PROPOSE_STREAM = 1_000_003
@@ -132,6 +133,18 @@ def lane_inputs(experiment: Experiment) -> tuple[Key[Array, "L"], HParams]:
     """Key, which depends on nothing but the seed, and hyper-parameters (leaves [L]) of every lane."""
     keys = jax.vmap(jax.random.key)(np.asarray([lane.seed for lane in experiment.lanes]))
     return keys, stack_hparams([lane.hparams for lane in experiment.lanes])
+
+
+def load_lanes(directory: Path, experiment: Experiment, trainer: Trainer) -> tuple[TrainState, Clock, HParams]:
+    """States and hyper-parameters (leaves [L, ...]) of a run directory's latest checkpoint, and its clock, on the first device.
+
+    Raises:
+      UsageError: there is none, or it cannot be read.
+    """
+    keys, hparams = lane_inputs(experiment)
+    here = Mesh(np.array(jax.devices()[:1]), ("lane",))
+    states, clock = load_states(RunDir(directory).checkpoints, trainer, keys, hparams, here)
+    return jax.tree.map(lambda x: x[: len(experiment.lanes)], states), clock, hparams
 
 
 def load_states(
