@@ -3,7 +3,8 @@
 * two CPU devices in each process, so that sharding is exercised for real;
 * a key used twice is an error (`jax_debug_key_reuse`);
 * mixing dtypes or ranks implicitly is an error (strict promotion);
-* programs are compiled without LLVM's optimisations: each runs a few times on small arrays, so compiling is what costs.
+* programs are compiled without LLVM's optimisations: each runs a few times on small arrays, so compiling is what costs;
+* compiled programs are dropped after each file: every one holds memory maps, and Linux kills a process that has too many.
 
 The settings are global rather than per test, so that module-scoped fixtures compile under them too.  A test that has to
 break one says so with `@pytest.mark.relaxed("dtype")` (any of "dtype", "rank", "keys"), and why.
@@ -52,6 +53,13 @@ def _standard_promotion(function: Callable[..., Any]) -> Callable[..., Any]:
 
 # Adam's bias correction raises a float to an int32 power, the one place in optax that strict promotion stops.
 optax.tree.bias_correction = _standard_promotion(optax.tree.bias_correction)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _drop_programs() -> Iterator[None]:
+    """Forgets what a file compiled, so that memory maps stay far from `vm.max_map_count` (65,530)."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture(autouse=True)
