@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+import envs
 import envs.rendering
 from apt_jax.specs import Params
 from experiments import episodes, plots, run_dir
@@ -25,7 +27,7 @@ def draw(path: Path, experiment: Experiment, problem: Problem, policies: Any) ->
     """Learning curves, progression of generated tasks, and the best lane's policy (leaves [L, ...]) on the target."""
     draw_curves(path, experiment)
     if run_dir.task_files(path):
-        draw_progression(path, experiment, problem)
+        draw_progression(path / "progression.png", path, experiment, problem.space, problem.target, problem.space.render)
         draw_tasks(path, experiment, problem)
     draw_policy(path, experiment, problem, policies)
 
@@ -41,21 +43,23 @@ def draw_curves(path: Path, experiment: Experiment) -> None:
     )
 
 
-def draw_progression(path: Path, experiment: Experiment, problem: Problem) -> None:
-    """progression.png: the first sampled task of each lane over time."""
+def draw_progression(
+    file: Path,
+    path: Path,
+    experiment: Experiment,
+    space: envs.BenchmarkSpace,
+    target: Any,
+    picture: Callable[[Any], plots.Image],
+) -> None:
+    """The first sampled task of each lane of the run in `path` over time, and the target; `picture` draws a task."""
     files = run_dir.task_files(path)
-    instantiate = jax.jit(problem.space.instantiate)
+    instantiate = jax.jit(space.instantiate)
     lanes = range(min(_ROWS, len(experiment.lanes)))
     boards = {}
     for step in plots.evenly(list(files), at_most=_COLUMNS):
         with np.load(files[step]) as w:
-            boards[step] = [problem.space.render(instantiate({name: w[name][lane, 0] for name in w})) for lane in lanes]
-    plots.progression(
-        path / "progression.png",
-        boards,
-        problem.space.render(problem.target),
-        rows=[experiment.lanes[lane].name for lane in lanes],
-    )
+            boards[step] = [picture(instantiate({name: w[name][lane, 0] for name in w})) for lane in lanes]
+    plots.progression(file, boards, picture(target), rows=[experiment.lanes[lane].name for lane in lanes])
 
 
 def draw_tasks(path: Path, experiment: Experiment, problem: Problem) -> None:

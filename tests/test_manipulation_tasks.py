@@ -74,6 +74,10 @@ class TestTargets:
 
 
 class TestSolver:
+    @pytest.mark.parametrize("name", TARGETS)
+    def test_it_finds_the_demonstrations(self, name):
+        assert solve(envs.load_target("manipulation", name), SPACE.goal_jitter) == list(DEMONSTRATIONS[name])
+
     def test_one_push(self):
         assert solve(table((52, 21))) == [RIGHT]
 

@@ -2,33 +2,38 @@
 
 from __future__ import annotations
 
-import jax
+import csv
+import re
+import shlex
+
 import numpy as np
 import pytest
+from PIL import Image
 
 import envs
-from apt_jax.config import PRESETS, Config, HParams
-from apt_jax.trainer import Clock, make_trainer
+from apt_jax.config import PRESETS
+from apt_jax.trainer import make_trainer
+from experiments import pictures, progression, run_dir, settings, train
+from experiments.errors import UsageError
 from tests.tables import SPACE
 
-CONFIG = Config(
-    envs_per_source=2,
-    warmup_steps=60,
-    updates_per_step=1,
-    batch_size=8,
-    replay_steps=100,
-    replay_episodes=16,
-    model_updates_per_step=0.25,
-    model_batch_size=4,
-    recent_steps=60,
-    refresh_every=4,
-    eval_every=8,
-    eval_episodes=2,
-    probe_tasks=2,
-    return_window=4,
+TABLE = """
+FF..FF
+FFFFFF
+FF#FFF
+FFFFFF
+can 20 20
+can 80 10
+range 30
+"""
+OPTIONS = shlex.split(
+    """--space manipulation --method apt_gen --seeds 0 --env-steps 76 --devices 1 --config.envs-per-source 2
+    --config.warmup-steps 60 --config.updates-per-step 1 --config.batch-size 8 --config.replay-steps 100
+    --config.replay-episodes 16 --config.model-updates-per-step 0.25 --config.model-batch-size 4 --config.recent-steps 60
+    --config.refresh-every 4 --config.eval-every 8 --config.eval-episodes 2 --config.probe-tasks 2 --config.return-window 4"""
 )
-UNDEFINED = {"probe_goal_way", "probe_can_distance"}
-"""Metrics that are NaN if no proposed task has the cans they are about."""
+UNDEFINED = {"probe_goal_way", "probe_can_distance", "behaviour_episode_return", "behaviour_success", "behaviour_length"}
+"""Metrics that are NaN if no proposed task has the cans they are about, or no episode ended between two evaluations."""
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -37,19 +42,60 @@ def test_every_preset_makes_a_trainer_for_every_target(preset, target):
     make_trainer(SPACE, envs.load_target("manipulation", target), PRESETS[preset][0])
 
 
-def test_two_chunks_of_apt_gen():
-    trainer = make_trainer(SPACE, envs.load_target("manipulation", "out_of_space"), CONFIG)
-    hparams = HParams()
-    state = jax.jit(trainer.init)(jax.random.key(0), hparams)
-    state, clock = jax.jit(trainer.warmup)(state, Clock.start(), hparams)
-    chunk = jax.jit(trainer.chunk)
-    for _ in range(2):
-        state, clock, metrics = chunk(state, clock, hparams)
-        for name, value in metrics.items():
-            assert np.isfinite(value) or name in UNDEFINED, name
-        assert 0 <= metrics["probe_pits"] + metrics["probe_roadblocks"] <= 1
-    assert clock.env_steps == 76
-    assert chunk._cache_size() == 1
-    obs = state.workers.obs["positions"]
-    assert np.isfinite(obs).all()
-    assert (np.asarray(obs[0]) != -1).all(), "the target's cans are all there"
+@pytest.fixture(scope="module")
+def own_table_run(tmp_path_factory):
+    """A run on a user's own table, from the command line."""
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "mine.txt").write_text(TABLE)
+    options = [*OPTIONS, "--target", str(folder / "mine.txt"), "--run-dir", str(folder / "run")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pictures, "draw", lambda *_: None)
+        assert train.train(*settings.parse(options)) == 0
+    return folder / "run"
+
+
+def test_a_users_own_table_is_trained_on(own_table_run):
+    with (own_table_run / "metrics.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(int(row["seed"]), int(row["env_steps"])) for row in rows] == [(0, 68), (0, 76)]
+    for row in rows:
+        assert {name for name, value in row.items() if not np.isfinite(float(value))} <= UNDEFINED
+        assert 0 <= float(row["probe_pits"]) + float(row["probe_roadblocks"]) <= 1
+    assert (own_table_run / "target.txt").read_text() == TABLE
+    assert (own_table_run / "checkpoints").is_dir()
+
+
+def test_a_table_with_a_mistake_is_refused_at_once(tmp_path):
+    (tmp_path / "mine.txt").write_text(TABLE.replace("#", "x"))
+    with pytest.raises(UsageError, match=re.escape("mine.txt: line 4, column 3: unknown character 'x'")):
+        train.train(*settings.parse([*OPTIONS, "--target", str(tmp_path / "mine.txt"), "--run-dir", str(tmp_path / "run")]))
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_progression_is_drawn_anew_also_with_the_robot(own_table_run, tmp_path):
+    progression.draw(progression.Args(own_table_run, tmp_path / "above.png"))
+    assert (tmp_path / "above.png").stat().st_size > 1000
+    try:
+        progression.draw(progression.Args(own_table_run, tmp_path / "robot.png", robot=True))
+    except UsageError as error:
+        pytest.skip(str(error))
+    with Image.open(tmp_path / "above.png") as above, Image.open(tmp_path / "robot.png") as robot:
+        assert robot.width == above.width
+        assert np.asarray(robot).tobytes() != np.asarray(above).tobytes()
+
+
+def test_mistakes_about_the_progression_are_told(own_table_run, tmp_path, monkeypatch):
+    def draw(**options):
+        progression.draw(progression.Args(**{"run_dir": own_table_run, "out": tmp_path / "it.png", **options}))
+
+    with pytest.raises(UsageError, match="nowhere is no directory"):
+        draw(out=tmp_path / "nowhere" / "it.png")
+    with pytest.raises(UsageError, match=r"config\.json"):
+        draw(run_dir=tmp_path)
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    with pytest.raises(UsageError, match="--robot: MUJOCO_GL is 'glfw'"):
+        draw(robot=True)
+    monkeypatch.setattr(run_dir, "task_files", lambda _: {})
+    with pytest.raises(UsageError, match="holds no generated tasks"):
+        draw()
+    assert not (tmp_path / "it.png").exists()

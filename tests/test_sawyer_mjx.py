@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 import envs
+from apt_jax.config import PRESETS
+from apt_jax.trainer import Clock, make_trainer
 from envs.manipulation import Space
 from envs.manipulation.push import GAP, STROKE, stroke
 from envs.manipulation.sawyer import pose, simulation
@@ -201,3 +203,13 @@ class TestOption:
     def test_places_seen_by_the_robot_are_mirrored(self):
         places = np.array([[0.1, 0.2], [0.9, 0.0]])
         np.testing.assert_allclose(mirror_places(places), [[0.8, 0.2], [0.0, 0.0]], atol=1e-9)
+
+
+def test_the_arm_in_mjx_goes_through_the_whole_program():
+    """Traced, not compiled."""
+    config, hparams = PRESETS["fast"]
+    trainer = make_trainer(envs.make("manipulation_sawyer"), envs.load_target("manipulation_sawyer", "B"), config)
+    start = jax.eval_shape(trainer.init, jax.random.key(0), hparams)
+    warm = jax.eval_shape(trainer.warmup, start, Clock.start(), hparams)
+    assert jax.eval_shape(trainer.chunk, *warm, hparams)[:2] == warm
+    assert warm[0] == start

@@ -115,8 +115,8 @@ def time_pushes(n: int, args: Args) -> Side:
     return Side(timing, _measure.peak_memory())
 
 
-def time_same_model(args: Args) -> Timing:
-    """The scene of a push by `mujoco.rollout`, on ground everywhere; its tool is driven by a strong servo along the stroke."""
+def same_model() -> tuple[mujoco.MjModel, mujoco.MjData, Float[np.ndarray, "state"], Float[np.ndarray, "steps 1"]]:
+    """The scene of a push, on ground everywhere, with a strong servo on its tool; the start of a push, the servo's course."""
     xml = scene.push_xml().replace("</mujoco>", '<actuator><position joint="tool" kp="2e6" kv="4e4"/></actuator></mujoco>')
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
@@ -124,7 +124,12 @@ def time_same_model(args: Args) -> Timing:
     state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     places = np.asarray(jax.vmap(stroke)(jnp.arange(STEPS) * scene.TIMESTEP)[0])
-    control = (TOOL_START + places)[None, :, None].astype(float)
+    return model, data, state, (TOOL_START + places)[:, None].astype(float)
+
+
+def time_same_model(args: Args) -> Timing:
+    """Pushes of `same_model` by `mujoco.rollout`."""
+    model, data, state, control = same_model()
     pushes = 2 if args.quick else 200
 
     def run() -> float:

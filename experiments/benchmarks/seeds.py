@@ -30,6 +30,7 @@ class Args(Options):
     """Time training with several seeds side by side.
 
     Attributes:
+      space: where to train, on its target A.
       seeds: numbers of seeds.
       layouts: how the seeds of one device are laid out.
       devices: numbers of devices that the seeds are spread over.
@@ -38,6 +39,7 @@ class Args(Options):
       chunk_steps: environment steps of each seed per measurement.
     """
 
+    space: Literal["grid_world", "manipulation"] = "grid_world"
     seeds: tuple[int, ...] = (1, 2, 4, 8, 16)
     layouts: tuple[Literal["map", "vmap"], ...] = ("map", "vmap")
     devices: tuple[int, ...] = (1, 2)
@@ -72,7 +74,8 @@ def main() -> int:
     ]
     header = ["layout", *(f"{seeds} seed{'s'[: seeds - 1]}" for seeds in args.seeds)]
     text = f"Seconds per seed and 1,000 environment steps, {args.cores} cores:\n\n{_measure.table(header, rows)}"
-    _measure.report("seeds", args, {"arrangements": results}, text)
+    name = "seeds" if args.space == "grid_world" else f"seeds_{args.space}"
+    _measure.report(name, args, {"arrangements": results}, text)
     return 0
 
 
@@ -84,6 +87,7 @@ def time_seeds(layout: Literal["map", "vmap"], devices: int, args: Args) -> Arra
         raise UsageError(f"--devices must be at most {jax.device_count()} here, got {devices}")
     space, target, config, hparams = _measure.load_problem(
         args.preset,
+        space=args.space,
         warmup_steps=1_000,
         refresh_every=args.chunk_steps,
         eval_every=args.chunk_steps,

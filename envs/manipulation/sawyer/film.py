@@ -1,4 +1,4 @@
-"""Films of the arm playing an episode."""
+"""Films of the arm playing an episode, and pictures of it in front of a task."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from envs.manipulation.sawyer.camera import Camera
-from envs.manipulation.sawyer.replay import Push, replay
+from envs.manipulation.sawyer.replay import Push, Scene, replay
+from envs.manipulation.sawyer.stage import mirror, mirror_places
 from envs.manipulation.table import Task
 
 FRAME_SECONDS = 0.16
@@ -40,3 +41,10 @@ def film(
 
         pushes = replay(task, goal, actions, watch)
     return frames, pushes
+
+
+def picture(task: Task) -> UInt8[np.ndarray, "360 480 3"]:
+    """A task as it starts, the arm at rest; raises `NoGraphics` if this machine cannot draw."""
+    scene = Scene(mirror(task), mirror_places(np.asarray(task.goal, float)))
+    with contextlib.closing(Camera(scene.model)) as camera:
+        return camera.picture(scene.data)

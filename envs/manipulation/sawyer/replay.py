@@ -73,7 +73,7 @@ def replay(task: Task, goal: Float[np.ndarray, "2"], actions: Sequence[int], wat
 class Scene:
     """The simulation of one episode, in the robot's view."""
 
-    def __init__(self, task: Task, goal: Float[np.ndarray, "2"], watch: Watch | None) -> None:
+    def __init__(self, task: Task, goal: Float[np.ndarray, "2"], watch: Watch | None = None) -> None:
         self.task, self.watch = task, watch
         self.model = stage(task, goal)
         self.data = mujoco.MjData(self.model)
