@@ -109,6 +109,9 @@ def check_hparams(hparams: HParams) -> None:
         **dict.fromkeys(not_negative + rates + scales, (0.0, math.inf, "at least 0")),
         **dict.fromkeys(shares, (0.0, 1.0, "in [0, 1]")),
     }
+    for field in dataclasses.fields(hparams):
+        if not math.isfinite(value := getattr(hparams, field.name)):
+            raise ValueError(f"{field.name} must be a finite number, got {value:g}")
     for name, (low, high, allowed) in ranges.items():
         value = getattr(hparams, name)
         if not low <= value <= high:

@@ -47,6 +47,8 @@ def start_run(path: Path, *options: str) -> Experiment:
         ("--seeds 1 2 1", "--seeds needs .* different .* got 1 2 1"),
         ("--seeds -1", "must not be negative"),
         ("--hparams.delta 0.1 0.1", "--hparams.delta needs .* different numbers, got 0.1 0.1"),
+        ("--hparams.delta nan", "delta must be a finite number, got nan"),
+        ("--hparams.beta-max inf", "beta_max must be a finite number, got inf"),
         ("--hparams.gamma 0.9 1.5", "gamma must be in .* got 1.5"),
         ("--at-once 0", "--at-once must be at least 1"),
         ("--method apt_gen+rdn", "closest is 'rnd'"),
@@ -92,6 +94,15 @@ def test_a_space_may_have_a_discount_of_its_own(tmp_path, space):
     assert experiment.hparams == PRESETS["fast"][1].replace(gamma=settings.GAMMA["manipulation"])
     experiment, _ = settings.parse([*words, "--hparams.gamma", "0.9"])
     assert experiment.hparams.gamma == 0.9
+
+
+def test_a_space_may_have_a_layout_of_its_own(tmp_path):
+    def layout(*words):
+        return settings.layout(*settings.parse(["--run-dir", str(tmp_path), *words]))
+
+    assert layout() == "auto"
+    assert layout("--space", "manipulation") == layout("--space", "manipulation_sawyer") == "vmap"
+    assert layout("--space", "manipulation", "--layout", "map") == "map"
 
 
 def test_a_file_does_not_hide_a_target_of_its_name(tmp_path, monkeypatch):
