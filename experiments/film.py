@@ -84,7 +84,7 @@ def save(out: Path, space: envs.BenchmarkSpace, task: Any, episode: Episode, *, 
 
 def _save_robot(out: Path, task: Any, episode: Episode) -> bool:
     """Whether it could be drawn; tells how the arm fared, whose cans go their own way."""
-    from envs.manipulation.sawyer import film as sawyer  # needs MuJoCo's own engine, which nothing else here does
+    from envs.manipulation.sawyer import film as sawyer  # slow to import
     from envs.manipulation.sawyer.camera import NoGraphics
 
     try:

@@ -54,7 +54,7 @@ def draw(args: Args) -> None:
     picture: Callable[[Any], plots.Image] = space.render
     if args.robot:
         film.check_robot(experiment.space)
-        from envs.manipulation.sawyer import film as sawyer  # needs MuJoCo's own engine, which nothing else here does
+        from envs.manipulation.sawyer import film as sawyer  # slow to import
         from envs.manipulation.sawyer.camera import NoGraphics
 
         picture = sawyer.picture

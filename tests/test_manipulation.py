@@ -20,7 +20,6 @@ class TestParameters:
     def test_there_are_31_variables(self):
         w = {name: struct.shape for name, struct in param_struct(SPACE.param_spec).items()}
         assert w == {"blocks": (6, 4, 3), "placement": (3, 24), "offset": (6,), "goal_range": (1,)}
-        assert 6 * 4 + 6 + 1 == 31  # a place is two variables, however it is chosen
 
     @pytest.mark.parametrize(("category", "height"), [(FLAT, 0.0), (PIT, -0.05), (ROADBLOCK, 0.10)])
     @pytest.mark.parametrize("block", [(0, 0), (5, 3), (2, 1)])

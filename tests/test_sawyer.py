@@ -163,7 +163,7 @@ class Witness:
       floating: metres that a can went that nothing had met yet.
       lifted: metres that a can rose above where it stands, at most.
       deepest: metres that two things were in each other, at most.
-      closest: metres between the arm and anything, or the tool and anything but cans; looked at every 20 ms.
+      closest: metres between the arm and anything, or the tool and anything but cans; looked at every 10 ms.
     """
 
     def __init__(self):
@@ -284,7 +284,7 @@ class TestReplay:
     )
     def test_an_event_ends_the_episode(self, place, action, event):
         task = table(place, rows="FFFFFF\nFFFFFF\nFFFFFF\nFF.#FF")
-        (push,) = replay.replay(task, np.array([0.1, 0.1]), [action, LEFT])[-1:]
+        (push,) = replay.replay(task, np.array([0.1, 0.1]), [action, LEFT])
         assert (push.event, push.success) == (event, False)
 
 

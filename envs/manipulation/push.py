@@ -1,4 +1,4 @@
-"""One push of a can on a table, simulated until the can has come to rest or the first event.
+"""One push of a can on a table, simulated until the can rests (for `STEPS` at most) or the first event.
 
 An event is a fall (off the table or into a hole) or a hit (of an obstacle or another can).  The physics knows the can, the
 tool and the ground; whether the can meets anything else is geometry.  The pose is frozen at the first event.
@@ -104,23 +104,16 @@ def push(
     direction: Int[Array, ""],
     arm: Arm = tool,
 ) -> Outcome:
-    """Pushes one can while the others stand still.
-
-    Nothing moves if the can is absent, or if there is no room for the tool behind it.
-    """
+    """Pushes one can while the others stand still; nothing moves unless `possible`."""
     start = cans[can]
     ahead = jnp.asarray(DIRECTIONS)[direction]
     others = present & (jnp.arange(CANS) != can)
+    carried_out = possible(task, cans, present, can=can, direction=direction)
     drive = arm(start, ahead)
 
     def to_table(points: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
         turned = drive.side * jnp.stack([-ahead[1], ahead[0]])
         return start[None] + points[:, :1] * ahead[None] + points[:, 1:] * turned[None]
-
-    def clearance(point: Float[Array, "2"]) -> Float[Array, ""]:
-        """Distance to the nearest obstacle or other can."""
-        to_cans = jnp.where(others, jnp.sqrt(jnp.sum((cans - point[None]) ** 2, axis=-1)) - CAN_RADIUS, FAR)
-        return jnp.minimum(jnp.min(to_cans), jnp.min(distances(task.obstacles, point)))
 
     def supported(feet: Float[Array, "feet 3"]) -> Bool[Array, "feet"]:
         return on_ground(task.ground, to_table(feet[:, :2])) & (feet[:, 2] > FOOT_RADIUS - STEP)
@@ -128,20 +121,32 @@ def push(
     def going(motion: Motion) -> Bool[Array, ""]:
         over = (motion.steps >= STEPS) | motion.fell | motion.hit
         slow = jnp.max(jnp.abs(motion.qvel[:6])) < REST_SPEED
-        return possible & ~over & ~((motion.steps > round(STROKE_SECONDS / TIMESTEP)) & slow)
+        return carried_out & ~over & ~((motion.steps > round(STROKE_SECONDS / TIMESTEP)) & slow)
 
     def advance(motion: Motion) -> Motion:
         moved = drive.advance(motion, supported)
         x, y, z = moved.qpos[:3]
         fell = (z < -SUNK) | (tilt_cosine(moved.qpos) < FALL_COSINE)
-        hit = clearance(to_table(jnp.stack([x, y])[None])[0]) < CAN_RADIUS
+        hit = clearance(task, cans, others, to_table(jnp.stack([x, y])[None])[0]) < CAN_RADIUS
         return moved._replace(fell=fell, hit=hit & ~fell)
 
-    behind = to_table(jnp.array([[TOOL_START, 0.0]]))[0]
-    possible = present[can] & (clearance(behind) > TOOL_RADIUS)
     end = jax.lax.while_loop(going, advance, drive.start)
     position = to_table(end.qpos[None, :2])[0]
-    return Outcome(jnp.where(possible, position, start), end.fell, end.hit)
+    return Outcome(jnp.where(carried_out, position, start), end.fell, end.hit)
+
+
+def possible(
+    task: Task, cans: Float[Array, "3 2"], present: Bool[Array, "3"], *, can: Int[Array, ""], direction: Int[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether a can is there and the tool finds room behind it."""
+    behind = cans[can] + TOOL_START * jnp.asarray(DIRECTIONS)[direction]
+    return present[can] & (clearance(task, cans, present & (jnp.arange(CANS) != can), behind) > TOOL_RADIUS)
+
+
+def clearance(task: Task, cans: Float[Array, "3 2"], those: Bool[Array, "3"], point: Float[Array, "2"]) -> Float[Array, ""]:
+    """Metres from a point to the nearest obstacle or one of `those` cans."""
+    to_cans = jnp.where(those, jnp.sqrt(jnp.sum((cans - point[None]) ** 2, axis=-1)) - CAN_RADIUS, FAR)
+    return jnp.minimum(jnp.min(to_cans), jnp.min(distances(task.obstacles, point)))
 
 
 def at_rest(joints: ArrayLike = (TOOL_START,)) -> Motion:

@@ -8,7 +8,8 @@ contact's friction lifts the can.  Hence two replacements, which `table_scene` d
 
 * The can stands on small spheres, which meet one infinite floor; where there is no ground under a sphere its contact is
   switched off.
-* Contacts have no friction.  The friction of the can's base is that of the joints which carry the base along x and y.
+* Contacts have no friction.  The friction of the can's base is that of the joints which carry the base along x and y.  It acts
+  along each axis by itself, and off the ground as well: there a can's end is already decided.
 """
 
 from __future__ import annotations

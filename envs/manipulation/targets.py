@@ -1,7 +1,8 @@
 """The paper's target tasks as text, read off the pictures on the authors' project page, and one that lies outside the space.
 
-Lengths were measured to 1.5 cm.  A and C are as measured.  In B the target is 0.5 cm further right and 0.6 cm closer to the
-robot: from the measured place no push sequence ends within the goal wherever its centre is drawn.
+Lengths were measured to 1.5 cm.  The cans of A and C are as measured; the goal is the space's, near which it stands in all
+pictures.  In B the target is 0.5 cm further right and 0.6 cm closer to the robot: from the measured place the search finds no
+push sequence that ends within the goal wherever its centre is drawn.
 
 The paper shows its out-of-space task (a table of another shape with a laptop, a lamp, a clock and books) in one small
 picture; this one is made in its likeness.
@@ -82,4 +83,4 @@ DEMONSTRATIONS = {
     "C": (6, 6, 5, 0, 0, 0, 0, 0),
     "out_of_space": (1, 4, 0, 4, 0, 0, 5, 0, 11, 0, 8, 3),
 }
-"""Actions of a shortest solution of each target (`solver.solve`), which succeed wherever the goal's centre is drawn."""
+"""Actions of the solution of each target that `solver.solve` finds; they succeed wherever the goal's centre is drawn."""

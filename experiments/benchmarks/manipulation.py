@@ -10,6 +10,7 @@ import dataclasses
 import math
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -18,11 +19,11 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 import tyro
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
 import envs
 from envs.manipulation import scene, table_scene
-from envs.manipulation.push import GAP, STEPS, STROKE, STROKE_SECONDS, TOOL_START, stroke
+from envs.manipulation.push import GAP, STEPS, STROKE, STROKE_SECONDS, TOOL_START, possible, stroke
 from envs.manipulation.table import DIRECTIONS, Task
 from experiments.benchmarks import _measure
 from experiments.benchmarks._measure import Options, Timing
@@ -86,9 +87,10 @@ def main() -> int:
 
 
 def random_pushes(key: Key[Array, ""], n: int) -> tuple[Any, Any, Array]:
-    """Uniformly random tasks, states and actions, leaves [n, ...]; consumes `key`.
+    """Uniformly random tasks, states and pushes of the first can, leaves [n, ...]; consumes `key`.
 
-    In the task space itself a push rarely finds its can, so the first can is made to appear and is the one that is pushed.
+    In the task space itself a push rarely finds its can, so the first is made to appear.  It is pushed in a direction that has
+    room for the tool behind it; were there none, nothing would move.
     """
     space = envs.make("manipulation")
     key_w, key_reset, key_action = jax.random.split(key, 3)
@@ -97,7 +99,13 @@ def random_pushes(key: Key[Array, ""], n: int) -> tuple[Any, Any, Array]:
     flat = jax.nn.one_hot(jnp.argmax(first, axis=-1), first.shape[-1]).reshape(w["blocks"].shape[:-1])
     tasks = jax.vmap(space.instantiate)({**w, "blocks": w["blocks"].at[..., 0].add(flat)})
     states, _ = jax.vmap(space.reset)(jax.random.split(key_reset, n), tasks)
-    return tasks, states, jax.random.randint(key_action, (n,), 0, len(DIRECTIONS))
+
+    def has_room(task: Task, cans: Float[Array, "3 2"]) -> Bool[Array, "4"]:
+        one = partial(possible, task, cans, task.present, can=jnp.int32(0))
+        return jax.vmap(lambda direction: one(direction=direction))(jnp.arange(len(DIRECTIONS)))
+
+    logits = jnp.where(jax.vmap(has_room)(tasks, states.cans), 0.0, -100.0)
+    return tasks, states, jax.random.categorical(key_action, logits)
 
 
 def time_pushes(n: int, args: Args) -> Side:

@@ -1,6 +1,7 @@
-"""How well a Sawyer arm's pushes agree with those of the tool alone: `python -m experiments.benchmarks.sawyer`.
+"""How well the task space's pushes agree with the truth: `python -m experiments.benchmarks.sawyer`.
 
-The arm is simulated twice: in MuJoCo, with the true shapes of everything on the table, and in MJX, as in the task space.
+Random pushes by the tool in MJX, beside the same ones in MuJoCo with the true shapes of everything on the table, by the tool
+and by the Sawyer arm, and by the arm in MJX.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from envs.manipulation.dynamics import State
 from envs.manipulation.push import Outcome, push
 from envs.manipulation.sawyer.replay import replay
 from envs.manipulation.table import Task
-from experiments.benchmarks import _measure
+from experiments.benchmarks import _measure, _true_shapes
 from experiments.benchmarks._measure import Options
 from experiments.benchmarks.manipulation import random_pushes
 from experiments.errors import exit_with
@@ -29,7 +30,7 @@ from experiments.errors import exit_with
 
 @dataclass(frozen=True)
 class Args(Options):
-    """Random pushes on uniformly random tables, by the tool alone and by the arm; each once, whatever `repeats` says.
+    """Random pushes on uniformly random tables, by the tool and by the arm; each once, whatever `repeats` says.
 
     Attributes:
       pushes: how many.
@@ -40,10 +41,10 @@ class Args(Options):
 
 @dataclass(frozen=True)
 class Agreement:
-    """How the pushes of both ended.
+    """How pushes ended beside the tool's in MJX.
 
     Attributes:
-      events: by the tool's event and the arm's, how many pushes.
+      events: by the tool's event and theirs, how many pushes.
       agree: share of the pushes with the same event.
       distances: metres between the can's places, for each push that both end without an event.
       seconds: per push.
@@ -64,14 +65,14 @@ def main() -> int:
     if args.quick:
         args = dataclasses.replace(args, pushes=2)
     results = measure(args.pushes)
-    header = ["pushes by the arm", "same event", "mean distance, mm", "largest, mm", "tracking, mm", "s per push"]
+    header = ["pushes", "same event", "mean distance, mm", "largest, mm", "tracking, mm", "s per push"]
     text = _measure.table(header, [_row(name, result) for name, result in results.items()])
     _measure.report("sawyer", args, {name: dataclasses.asdict(result) for name, result in results.items()}, text)
     return 0
 
 
 def measure(pushes: int) -> dict[str, Agreement]:
-    """Random pushes of the first can: how those of each arm agree with the tool's."""
+    """Random pushes of the first can: how those of the others agree with the tool's in MJX."""
     tasks, states, directions = jax.device_get(random_pushes(jax.random.key(0), pushes))
 
     def simulate(name: str) -> tuple[Outcome, float]:
@@ -89,13 +90,19 @@ def measure(pushes: int) -> dict[str, Agreement]:
     inside, inside_seconds = simulate("sawyer")
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], tasks) for i in range(pushes)]
     began = time.perf_counter()
+    true = [_true_shapes.push(each[i], 0, int(directions[i])) for i in range(pushes)]
+    true_seconds = (time.perf_counter() - began) / pushes
+    began = time.perf_counter()
     played = [replay(each[i], states.goal[i], [directions[i]])[0] for i in range(pushes)]
     seconds = (time.perf_counter() - began) / pushes
     events, places = np.array([one.event for one in played]), np.array([one.cans[0] for one in played])
     tracking = max(one.tracking for one in played)
     return {
-        "MuJoCo, true shapes": _agreement(tool, events, places, seconds, tracking),
-        "MJX": _agreement(tool, _events(inside), np.asarray(inside.position), inside_seconds, None),
+        "the tool in MuJoCo, true shapes": _agreement(
+            tool, np.array([event for _, event in true]), np.array([place for place, _ in true]), true_seconds, None
+        ),
+        "the arm in MuJoCo, true shapes": _agreement(tool, events, places, seconds, tracking),
+        "the arm in MJX": _agreement(tool, _events(inside), np.asarray(inside.position), inside_seconds, None),
     }
 
 
@@ -123,7 +130,7 @@ def _row(name: str, result: Agreement) -> list[str]:
     away = [_measure.number(float(value)) for value in (distances.mean(), distances.max())]
     tracking = "" if result.tracking is None else _measure.number(1000 * result.tracking)
     pushes, same = sum(result.events.values()), f"{_measure.number(100 * result.agree)} %"
-    return [f"{pushes} in {name}", same, *away, tracking, _measure.number(result.seconds)]
+    return [f"{pushes} by {name}", same, *away, tracking, _measure.number(result.seconds)]
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 Frames, masses, inertias and limits of position, speed and torque are the manufacturer's, from
 `sawyer_description/urdf/sawyer_base.urdf.xacro` of Rethink Robotics' `sawyer_robot` (Apache-2.0).  The joints have no friction
-and the motors no inertia of their own: that file gives no measured ones.
+and the motors no inertia of their own: that file gives none that is measured (damping and friction 5 for every joint alike).
 
 A link reaches from its joint's axis to the next one's, so the housings follow from the frames; their radii are about those of
 the same file's collision shapes.

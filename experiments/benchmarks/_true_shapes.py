@@ -6,21 +6,22 @@ import math
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from envs.manipulation import table_scene
 from envs.manipulation.push import GAP, STROKE, STROKE_SECONDS, TOOL_START
-from envs.manipulation.table import CAN_HEIGHT, DIRECTIONS
+from envs.manipulation.table import CAN_HEIGHT, DIRECTIONS, Task
 
 SECONDS = 2.0
 REST = 1e-3
 """Long enough for whatever leans to fall, and the speed (m/s and rad/s) below which nothing does."""
 
 
-def push(task, cans, can, direction):
+def push(task: Task, can: int, direction: int) -> tuple[Float[np.ndarray, "2"], str]:
     """(x, y) of the pushed can, and one of "", "fell", "hit"; there must be room for the tool."""
-    ahead = DIRECTIONS[direction].astype(float)
-    x, y = np.asarray(cans[can], float) + TOOL_START * ahead
-    xml = table_scene.table_xml(task, np.asarray(cans, float), (x, y, math.atan2(ahead[1], ahead[0])))
+    ahead, cans = DIRECTIONS[direction].astype(float), np.asarray(task.cans, float)
+    x, y = cans[can] + TOOL_START * ahead
+    xml = table_scene.table_xml(task, cans, (x, y, math.atan2(ahead[1], ahead[0])))
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     tool, body = model.joint("tool"), model.body(f"can{can}").id
