@@ -17,9 +17,10 @@ from itertools import chain, islice, zip_longest
 from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Key
+from jaxtyping import Array, Int, Key
 
 from apt_jax.config import HParams
 from apt_jax.curricula.base import Metrics
@@ -94,14 +95,18 @@ def make_program(
     def pad(tree: Any) -> Any:
         return jax.tree.map(lambda x: x[padded], tree)
 
-    def over_lanes(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
-        if width == per_device and layout == "vmap":
-            batched = _vmap(function, in_specs, out_specs)
-        else:
-            batched = _map(function, in_specs, out_specs, width=width)
+    def sharded(batched: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
         return jax.shard_map(batched, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
 
-    init = over_lanes(trainer.init, (lane, lane), lane)
+    def over_lanes(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
+        if width == per_device and layout == "vmap":
+            return sharded(_vmap(function, in_specs, out_specs), in_specs, out_specs)
+        return sharded(_map(function, in_specs, out_specs, width=width), in_specs, out_specs)
+
+    def init_lanes(keys: Key[Array, "L"], hparams: HParams) -> TrainState:
+        return jax.lax.map(lambda lane: trainer.init(*lane), (keys, hparams), batch_size=None if width == 1 else width)
+
+    init = sharded(init_lanes, (lane, lane), lane)
     warmup = over_lanes(trainer.warmup, (lane, shared, lane), (lane, shared))
     chunk = over_lanes(trainer.chunk, (lane, shared, lane), (lane, shared, lane))
 
@@ -157,22 +162,59 @@ def _vmap(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callab
 
 
 def _map(function: Callable[..., Any], in_specs: Any, out_specs: Any, *, width: int) -> Callable[..., Any]:
-    """Like `_vmap`, `width` lanes after `width` others."""
-    batched = [axis == 0 for axis in _axes(in_specs)]
+    """Like `_vmap`, `width` lanes after `width` others, for functions whose first argument and first result are the states.
 
-    def mapped(*args: Any) -> Any:
-        def one(lane_args: list[Any]) -> Any:
-            rest = iter(lane_args)
-            return function(*(next(rest) if b else arg for b, arg in zip(batched, args, strict=True)))
+    Each group's states are taken out of the others' and put back in their place, so that there is room for one group besides.
+    """
+    lanes_in, lanes_out = ([axis == 0 for axis in _axes(specs)] for specs in (in_specs, out_specs))
+    several = _vmap(function, in_specs, out_specs)
 
-        lane_args = [arg for b, arg in zip(batched, args, strict=True) if b]
-        out = jax.lax.map(one, lane_args, batch_size=None if width == 1 else width)
-        if not isinstance(out_specs, tuple):
-            return out
-        # What is shared came out once per lane, all alike.
-        return tuple(
-            value if axis == 0 else jax.tree.map(lambda x: x[0], value)
-            for value, axis in zip(out, _axes(out_specs), strict=True)
-        )
+    def alone(*args: Any) -> tuple[Any, ...]:
+        """One lane, not as a batch, so that it computes what it computes by itself."""
+        lane = [jax.tree.map(lambda x: x[0], arg) if of_lanes else arg for of_lanes, arg in zip(lanes_in, args, strict=True)]
+        results = zip(lanes_out, function(*lane), strict=True)
+        return tuple(jax.tree.map(lambda x: x[None], result) if of_lanes else result for of_lanes, result in results)
+
+    def mapped(states: TrainState, *rest: Any) -> Any:
+        def group(data: Any, start: Int[Array, ""] | int, size: int) -> tuple[Any, list[Any]]:
+            """All states after `size` lanes from `start` had their turn, and what else these yielded."""
+
+            def pick(tree: Any) -> Any:
+                return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, size), tree)
+
+            turn = [pick(arg) if of_lanes else arg for of_lanes, arg in zip(lanes_in[1:], rest, strict=True)]
+            new, *yielded = (alone if size == 1 else several)(_with_keys(pick(data), states), *turn)
+            put = jax.lax.dynamic_update_slice_in_dim
+            return jax.tree.map(lambda old, x: put(old, x, start, 0), data, _as_data(new)), yielded
+
+        turns, left = divmod(jax.tree.leaves(states)[0].shape[0], width)
+        starts = width * jnp.arange(turns, dtype=jnp.int32)
+        data, yielded = jax.lax.scan(lambda data, start: group(data, start, width), _as_data(states), starts)
+        # What is shared came out once per turn, all alike.
+        flat = {True: lambda x: x.reshape(-1, *x.shape[2:]), False: lambda x: x[0]}
+        results = [jax.tree.map(flat[of_lanes], value) for of_lanes, value in zip(lanes_out[1:], yielded, strict=True)]
+        if left:
+            data, last = group(data, turns * width, left)
+            results = [
+                jax.tree.map(lambda *parts: jnp.concatenate(parts), value, more) if of_lanes else value
+                for of_lanes, value, more in zip(lanes_out[1:], results, last, strict=True)
+            ]
+        return _with_keys(data, states), *results
 
     return mapped
+
+
+def _is_key(x: Array) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _as_data(tree: Any) -> Any:
+    """Keys as numbers: checks against a key's second use cannot tell the keys of one array apart."""
+    return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, tree)
+
+
+def _with_keys(data: Any, like: Any) -> Any:
+    """`_as_data` undone, for a tree whose keys are where those of `like` are."""
+    return jax.tree.map(
+        lambda x, key: jax.random.wrap_key_data(x, impl=jax.random.key_impl(key)) if _is_key(key) else x, data, like
+    )

@@ -132,12 +132,12 @@ def text(chunk):
     return chunk.as_text()
 
 
-def program():
-    return make_program(make_trainer(PairedCorridor(), np.int32(7), CONFIG), 2)
+def program(count=2, **options):
+    return make_program(make_trainer(PairedCorridor(), np.int32(7), CONFIG), count, **options)
 
 
-def lanes():
-    return jax.eval_shape(lambda: jax.vmap(jax.random.key)(np.arange(2))), stack_hparams([HParams()] * 2)
+def lanes(count=2):
+    return jax.eval_shape(lambda: jax.vmap(jax.random.key)(np.arange(count))), stack_hparams([HParams()] * count)
 
 
 def test_no_ring_is_copied_in_the_loop(text):
@@ -148,6 +148,15 @@ def test_there_is_no_room_for_a_copy_of_a_ring(chunk, states):
     """Nor outside the loop: all that a device needs besides its state is less than the smallest ring."""
     rings = jax.tree.leaves(states.replay.transitions)
     assert chunk.memory_analysis().temp_size_in_bytes < min(ring.size * ring.dtype.itemsize // 2 for ring in rings)
+
+
+def test_lanes_that_take_turns_have_room_for_one_besides():
+    """Three on one device: the one at work is taken out and put back."""
+    turns = program(3, layout="map", devices=jax.devices()[:1])
+    states = jax.eval_shape(turns.init, *lanes(3))
+    memory = turns.chunk.lower(states, jax.eval_shape(Clock.start), lanes(3)[1]).compile().memory_analysis()
+    one = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(states.replay)) / 3
+    assert memory.temp_size_in_bytes < 1.2 * one
 
 
 def test_every_buffer_of_the_state_is_reused(text, states):

@@ -23,6 +23,7 @@ from envs.manipulation.scene import TOOL_HALF, TOOL_HEIGHT
 from envs.manipulation.table import DIRECTIONS, landscape
 from envs.manipulation.targets import DEMONSTRATIONS
 from experiments import film
+from experiments.episodes import Episode
 from experiments.errors import UsageError
 from tests.tables import AWAY, BLUE, GREEN, LEFT, NEAR, RIGHT, push_all, table
 from tests.test_manipulation_physics import random_cases
@@ -328,6 +329,24 @@ class TestFilm:
         (blue_y, blue_x), (green_y, green_x), (robot_y, robot_x) = (np.argwhere(color).mean(axis=0) for color in colors)
         assert blue_x < robot_x < green_x
         assert robot_y < min(blue_y, green_y)
+
+    def test_the_arm_plays_an_episode(self, tmp_path, capsys):
+        """One push to the goal: the can is where it was in the first picture, and elsewhere in the last."""
+        task = table((52, 21))
+        start, _ = Space().reset(jax.random.key(0), task)
+        film.save(tmp_path / "film.gif", Space(), task, Episode([start._replace(goal=task.goal)], [RIGHT], True), robot=True)
+        told = capsys.readouterr()
+        if "install EGL" in told.err:
+            pytest.skip(told.err)
+        assert told.out == "the arm: success after 1 pushes\n"
+        with Image.open(tmp_path / "film.gif") as film_:
+            assert film_.size == stage.PICTURE
+            pictures = []
+            for index in (0, film_.n_frames - 1):
+                film_.seek(index)
+                pictures.append(np.asarray(film_.convert("RGB"), int))
+        cans = [np.argwhere(picture[..., 2] > 1.5 * picture[..., :2].max(axis=-1)).mean(axis=0) for picture in pictures]
+        assert cans[1][1] - cans[0][1] > 10
 
     def test_mistakes_are_told(self, tmp_path):
         with pytest.raises(UsageError, match="is no directory"):
