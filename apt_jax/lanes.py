@@ -5,8 +5,7 @@ devices, also those of other hosts, and jitted.  The program has no collectives,
 device that waits for another longer than a minute ends the process: XLA takes it for a deadlock).
 
 Within a device, lanes run side by side ("vmap", for accelerators) or one after another ("map", for CPUs: with a device per core
-both take as long where environments are cheap, and "map" computes in every lane what it computes alone; see BENCHMARKS.md,
-"Many seeds").
+both take as long, and "map" computes in every lane what it computes alone; BENCHMARKS.md, "Many seeds").
 """
 
 from __future__ import annotations

@@ -29,9 +29,6 @@ GAMMA: Mapping[str, float] = {"manipulation": 0.85, "manipulation_sawyer": 0.85}
 None of Manipulation's 15 pushes costs anything: at 0.99 the way and a detour differ by less than a network can tell.
 """
 
-LAYOUT: Mapping[str, Layout] = {"manipulation": "vmap", "manipulation_sawyer": "vmap"}
-"""Spaces whose lanes have a layout of their own, whatever the device: physics costs less side by side, also on a CPU."""
-
 
 @dataclass(frozen=True)
 class Experiment:
@@ -74,7 +71,7 @@ class Session:
         options override single fields.
       method: short for --config.method: apt_gen, apt_gen_progress_only, apt_gen_return_only, random, alp_gmm, goal_gan, dqn,
         icm, rnd, ride, or one with a bonus added as in "apt_gen+rnd".
-      layout: how the lanes of one device are laid out; by default vmap on accelerators and in Manipulation, else map.
+      layout: how the lanes of one device are laid out; by default map on CPU and vmap on accelerators.
       at_once: lanes of a device side by side under layout vmap, the others in turn, if all do not fit its memory; layout map,
         the one of CPUs, has one at a time anyway.
       devices: devices the host CPU counts as, by default one per core; lanes are spread over them.
@@ -250,11 +247,6 @@ def _numbers(saved: Any) -> Any:
 def target_name(experiment: Experiment) -> str:
     """What to call the target in a title."""
     return experiment.target_file.name if experiment.target_file else experiment.target
-
-
-def layout(experiment: Experiment, session: Session) -> Layout:
-    """How the lanes of one device are to be laid out: as asked, else as the space (see `LAYOUT`) or the device wants it."""
-    return LAYOUT.get(experiment.space, "auto") if session.layout == "auto" else session.layout
 
 
 def _comparable(experiment: Experiment) -> dict[str, Any]:

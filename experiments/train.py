@@ -21,7 +21,7 @@ from experiments.problem import make_problem
 from experiments.progress import Metrics, View, make_view
 from experiments.run_dir import RunDir
 from experiments.runner import Runner
-from experiments.settings import Experiment, Session, layout, parse
+from experiments.settings import Experiment, Session, parse
 from experiments.sinks import Sink, check_installed, make_sinks
 from experiments.summary import Times, is_complete, summarise
 
@@ -51,7 +51,7 @@ def train(experiment: Experiment, session: Session) -> int:
     problem = make_problem(experiment)
     check_installed(session.sinks)
     processes.check_same(repr((experiment, dataclasses.replace(session, process_id=None))))
-    runner = Runner(problem.trainer, experiment, layout(experiment, session), session.at_once)
+    runner = Runner(problem.trainer, experiment, session.layout, session.at_once)
     run = RunDir(session.run_dir)
     start = processes.from_first(lambda: open_run(experiment, session))
     if processes.from_first(lambda: is_complete(run.path, experiment)):

@@ -96,15 +96,6 @@ def test_a_space_may_have_a_discount_of_its_own(tmp_path, space):
     assert experiment.hparams.gamma == 0.9
 
 
-def test_a_space_may_have_a_layout_of_its_own(tmp_path):
-    def layout(*words):
-        return settings.layout(*settings.parse(["--run-dir", str(tmp_path), *words]))
-
-    assert layout() == "auto"
-    assert layout("--space", "manipulation") == layout("--space", "manipulation_sawyer") == "vmap"
-    assert layout("--space", "manipulation", "--layout", "map") == "map"
-
-
 def test_a_file_does_not_hide_a_target_of_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("A", "mine"):

@@ -45,7 +45,7 @@ class Args(Options):
     devices: tuple[int, ...] = (1, 2)
     cores: int = 2
     preset: Literal["paper", "fast"] = "fast"
-    chunk_steps: int = 100
+    chunk_steps: int = 1_000
 
 
 @dataclass(frozen=True)
