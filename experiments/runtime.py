@@ -10,7 +10,7 @@ from pathlib import Path
 
 import jax
 
-_PACKAGES = ("apt-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+_PACKAGES = ("apt-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "numpy")
 _MIN_COMPILE_SECONDS = 1.0
 """Programs that compile faster are not worth a file in the cache."""
 
