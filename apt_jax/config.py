@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 from dataclasses import dataclass
 from typing import Literal
 
@@ -105,13 +106,11 @@ def check_hparams(hparams: HParams) -> None:
         "goal_old_share",
     )
     ranges = {
+        "delta": (-sys.float_info.max, sys.float_info.max, "finite"),
         **dict.fromkeys(positive, (math.ulp(0.0), math.inf, "above 0")),
         **dict.fromkeys(not_negative + rates + scales, (0.0, math.inf, "at least 0")),
         **dict.fromkeys(shares, (0.0, 1.0, "in [0, 1]")),
     }
-    for field in dataclasses.fields(hparams):
-        if not math.isfinite(value := getattr(hparams, field.name)):
-            raise ValueError(f"{field.name} must be a finite number, got {value:g}")
     for name, (low, high, allowed) in ranges.items():
         value = getattr(hparams, name)
         if not low <= value <= high:
