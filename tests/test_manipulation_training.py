@@ -15,6 +15,8 @@ from apt_jax.config import PRESETS
 from apt_jax.trainer import make_trainer
 from experiments import pictures, progression, run_dir, settings, train
 from experiments.errors import UsageError
+from experiments.problem import make_problem
+from experiments.runner import load_lanes
 from tests.tables import SPACE
 
 TABLE = """
@@ -62,7 +64,16 @@ def test_a_users_own_table_is_trained_on(own_table_run):
         assert {name for name, value in row.items() if not np.isfinite(float(value))} <= UNDEFINED
         assert 0 <= float(row["probe_pits"]) + float(row["probe_roadblocks"]) <= 1
     assert (own_table_run / "target.txt").read_text() == TABLE
-    assert (own_table_run / "checkpoints").is_dir()
+
+
+def test_what_was_saved_is_where_the_table_has_it(own_table_run):
+    experiment = settings.load(own_table_run)
+    states, clock, _ = load_lanes(own_table_run, experiment, make_problem(experiment).trainer)
+    positions = np.asarray(states.workers.obs["positions"][0])
+    assert clock.env_steps == 76
+    assert np.isfinite(positions).all()
+    assert (positions[0, :, :4] != -1).all(), "the target's two cans are there"
+    assert (positions[0, :, 4:6] == -1).all(), "and no third"
 
 
 def test_a_table_with_a_mistake_is_refused_at_once(tmp_path):
@@ -81,7 +92,9 @@ def test_the_progression_is_drawn_anew_also_with_the_robot(own_table_run, tmp_pa
         pytest.skip(str(error))
     with Image.open(tmp_path / "above.png") as above, Image.open(tmp_path / "robot.png") as robot:
         assert robot.width == above.width
-        assert np.asarray(robot).tobytes() != np.asarray(above).tobytes()
+        for picture, expected in ((above, False), (robot, True)):
+            red, green, blue = np.moveaxis(np.asarray(picture.convert("RGB"), int), -1, 0)
+            assert (((red > 80) & (red > 3 * green) & (red > 3 * blue)).sum() > 100) == expected, "the robot is red"
 
 
 def test_mistakes_about_the_progression_are_told(own_table_run, tmp_path, monkeypatch):
