@@ -8,7 +8,6 @@ JOBS ?= 2
 PYTEST_ARGS ?= -n $(JOBS) --dist loadfile --max-worker-restart=0 --durations=10
 ARGS ?= --space grid_world --target A --method apt_gen --preset fast --seeds 0 --run-dir runs/quickstart \
 	$(if $(wildcard runs/quickstart/config.json),--resume)
-BENCHMARKS ?= $(basename $(notdir $(wildcard experiments/benchmarks/[a-z]*.py)))
 BENCH_ARGS ?=
 
 BIN := $(VENV)/bin
@@ -41,8 +40,9 @@ format: $(STAMP) ## Mend style and format where a tool can.
 peers: $(STAMP) ## Install what the benchmarks compare with; they leave out what is missing.
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS),peers]'
 
-bench: $(STAMP) ## Run every benchmark, or those that BENCHMARKS names.
-	@set -e; for name in $(BENCHMARKS); do echo "== $$name"; $(BIN)/python -m experiments.benchmarks.$$name $(BENCH_ARGS); done
+bench: $(STAMP) ## Measure what was not measured at this commit, write BENCHMARKS.md's tables anew; BENCH_ARGS="--only seeds" for some.
+	$(BIN)/python -m experiments.benchmarks $(BENCH_ARGS)
+	$(BIN)/python -m experiments.document
 
 constraints: ## Pin today's versions in constraints.txt.
 	@set -e; tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; \

@@ -42,8 +42,20 @@ def describe() -> dict[str, object]:
         "device_kind": devices[0].device_kind,
         "devices": len(devices),
         "processes": jax.process_count(),
-        "git_commit": _git_commit(),
+        "git_commit": git_commit(),
     }
+
+
+def git_commit() -> str | None:
+    """The commit that runs, with "-dirty" where the code differs from it; texts and results make no difference."""
+    git = ["git", "-C", str(Path(__file__).parent.parent)]
+    code = [".", ":(exclude)*.md", ":(exclude)experiments/results"]
+    try:
+        commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+        same = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", *code], capture_output=True, check=False).returncode == 0
+    except (OSError, subprocess.CalledProcessError):  # no git, or not a checkout
+        return None
+    return commit if same else f"{commit}-dirty"
 
 
 def _cores() -> int:
@@ -58,12 +70,4 @@ def _version(package: str) -> str | None:
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:  # run from a checkout that is not installed
-        return None
-
-
-def _git_commit() -> str | None:
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):  # no git, or not a checkout
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,19 +53,28 @@ def main() -> int:
     signs = tyro.cli(Signs, prog="python -m experiments.signs", description=__doc__)
     if not signs.runs:
         raise UsageError("--runs needs at least one directory")
+    print(table(signs.runs, after=signs.after))
+    return 0
+
+
+def table(runs: Sequence[Path], *, after: int = Signs.after) -> str:
+    """A Markdown table with a line per seed.
+
+    Raises:
+      UsageError: no evaluation yet, a run without a generator, or one that ended before `after`.
+    """
     rows = []
-    for path in signs.runs:
+    for path in runs:
         config = run_dir.read_config(path)
         env_steps, curves = run_dir.read_metrics(path)
         if "beta" not in curves:
             raise UsageError(f"{path} has no generator: its method is {config['config']['method']}")
-        if env_steps[-1] <= signs.after:
-            raise UsageError(f"--after must be below the {env_steps[-1]:,} steps of {path}, got {signs.after:,}")
+        if env_steps[-1] <= after:
+            raise UsageError(f"--after must be below the {env_steps[-1]:,} steps of {path}, got {after:,}")
         for lane, seed in enumerate(config["seeds"]):
             seed_curves = {name: values[lane] for name, values in curves.items()}
-            rows.append(row(path.name, seed, env_steps, seed_curves, signs.after, config["hparams"]))
-    print("\n".join((f"| {' | '.join(HEADER)} |", "|---" * len(HEADER) + "|", *rows)))
-    return 0
+            rows.append(row(path.name, seed, env_steps, seed_curves, after, config["hparams"]))
+    return "\n".join((f"| {' | '.join(HEADER)} |", "|---" * len(HEADER) + "|", *rows))
 
 
 def row(

@@ -3,21 +3,36 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import math
 import os
 import subprocess
 import sys
+from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tyro
 
 import envs
+from apt_jax import learner
 from apt_jax.config import Config, HParams
 from apt_jax.trainer import make_trainer
-from experiments.benchmarks import _flops, _measure, dqn_peers, environments, growth, training_step, training_throughput
+from experiments.benchmarks import __main__ as everything
+from experiments.benchmarks import (
+    _flops,
+    _measure,
+    dqn_peers,
+    environments,
+    growth,
+    training_step,
+    training_throughput,
+    variants,
+)
 from experiments.benchmarks._grid_worlds import JaxWorld, restart
 from experiments.benchmarks._stretched import Stretched
 from tests.corridor import Corridor
@@ -81,9 +96,11 @@ def test_results_of_a_training_step_are_json_and_a_table(result):
         "models",
         "work",
     }
-    text = training_step.tables("tiny", result, rate=1e9)
+    text = training_step.tables({"tiny": result, "same": result}, rate=1e9)
+    assert "| part | tiny: ms | tiny: of the sum | tiny: compile, s | same: ms |" in text
     assert "| sum of the parts |" in text
-    assert "Whole / sum of the parts:" in text
+    ratio = f"{result.chunk.median / result.sum_of_parts:.2f}"
+    assert f"Whole / sum of the parts: {ratio} (tiny), {ratio} (same)." in text
 
 
 def test_the_work_of_a_training_step_is_counted(result):
@@ -92,8 +109,8 @@ def test_the_work_of_a_training_step_is_counted(result):
     assert jointly.matmul_flops == sum(one.matmul_flops for one in models)
     assert jointly.matmul_seconds == sum(one.matmul_seconds for one in models) > 10  # products
     assert step.matmul_flops == CONFIG.updates_per_step * policy.matmul_flops + 0.5 * jointly.matmul_flops
-    text = training_step.work_table("one", {"half of it": training_step.Work(3e6, 2e6, 0.001, 0.004)}, rate=1e9)
-    assert "| half of it | 3 | 2 | 0.5 | 25.0% | 50.0% |" in text
+    rows = training_step.work_rows({"half of it": training_step.Work(3e6, 2e6, 0.001, 0.004)}, rate=1e9)
+    assert rows == {"half of it": ["2", "50.0%", "25.0%"]}
 
 
 def test_a_matmul_is_timed_there_and_back():
@@ -245,3 +262,40 @@ def test_every_size_of_growth_fits_the_preset():
         for size in sizes:
             problem = growth.load_problem(growth.at(axis, size), quick=True)
             make_trainer(problem.space, problem.target, problem.config)
+
+
+@pytest.fixture(scope="module")
+def played():
+    problem = _measure.Problem(Corridor(), np.int32(7), CONFIG, HParams())
+    return problem, variants.play(problem)
+
+
+@pytest.mark.parametrize("name", [name for name, variant in variants.VARIANTS.items() if not variant.flags])
+def test_a_variant_of_the_policy_update_learns(name, played):
+    """What draws the same batches and has the same network ends up with the same parameters."""
+    problem, rings = played
+    variant = variants.VARIANTS[name]
+    material = variants.make_material(problem, rings, widen=variant.widen)
+    state = learner.init(material.network, jax.random.key(0))
+    after = jax.jit(variant.make(material))(state, rings, jax.random.key(1))
+    assert not np.array_equal(*(jax.tree.leaves(each.params)[0] for each in (state, after)))
+    if name not in ("each batch sampled by itself", "inputs padded to whole registers"):
+        as_it_is = jax.jit(variants.as_it_is(material))(state, rings, jax.random.key(1))
+        chex.assert_trees_all_close(after.params, as_it_is.params, atol=1e-6)
+
+
+def test_a_variant_is_compared_turn_by_turn():
+    first = _measure.Timing((1.0, 2.0, 4.0), 3.0)
+    text = variants.table(
+        {variants.FIRST: first, "xla_cpu_enable_fast_math=true": _measure.Timing((0.5, 2.0, 2.0), 1.0)}, updates=10
+    )
+    assert "| as it is | 200 (100 to 400) | 1.00 (1.00 to 1.00) | 3.0 |" in text
+    assert "| `xla_cpu_enable_fast_math=true` | 200 (50 to 200) | 0.50 (0.50 to 1.00) | 1.0 |" in text
+
+
+def test_every_benchmark_is_in_the_list_of_all():
+    scripts = {path.stem for path in Path(variants.__file__).parent.glob("[a-z]*.py")}
+    assert {script for script, *_ in everything.RUNS.values()} == scripts
+    for script, *options in everything.RUNS.values():
+        module = importlib.import_module(f"experiments.benchmarks.{script}")
+        tyro.cli(module.Args, args=options)

@@ -237,21 +237,32 @@ def result_path(name: str, options: Options) -> Path:
 
 
 def report(name: str, options: Options, results: Mapping[str, Any], text: str) -> None:
-    """Prints the tables and writes the raw numbers with all that is needed to read them."""
+    """Prints the tables and writes them with the raw numbers and all that is needed to read these."""
     environment = {**runtime.describe(), "cpu": _cpu_model(), "cores": os.cpu_count(), "load_average": _LOAD_AVERAGE}
     settings = {key: value for key, value in dataclasses.asdict(options).items() if key != "out"}
-    content = {"benchmark": name, "settings": settings, "environment": environment, "results": results}
+    text = f"{text.strip()}\n\n{_caption(environment, options)}"
+    content = {
+        "benchmark": name,
+        "settings": settings,
+        "environment": environment,
+        "results": results,
+        "text": text.splitlines(),
+    }
     path = result_path(name, options)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1, default=dataclasses.asdict) + "\n")
-    print(f"{text}\n{_caption(environment)}\nRaw numbers: {path}")
+    print(f"{text}\n\nRaw numbers: {path}")
 
 
-def _caption(environment: Mapping[str, Any]) -> str:
-    """The machine and the versions in one line."""
+def _caption(environment: Mapping[str, Any], options: Options) -> str:
+    """What a reader of the tables has to know: repeats, machine, versions, commit, and what else was running."""
     packages = environment["packages"]
     versions = ", ".join(f"{name} {packages[name]}" for name in ("jax", "jaxlib", "flax", "optax", "numpy"))
-    return f"{environment['cpu']}, {environment['cores']} cores, {environment['device_kind']}; {versions}."
+    return (
+        f"{options.repeats} repeats, median (range); {environment['cpu']}, {environment['cores']} cores, "
+        f"{environment['device_kind']}; {versions}; commit {(environment['git_commit'] or 'unknown')[:12]}; "
+        f"load average before it began {environment['load_average'][0]:.2f}."
+    )
 
 
 def _cpu_model() -> str:

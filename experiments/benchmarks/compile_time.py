@@ -32,11 +32,13 @@ class Args(Options):
     """Time the start of a training run.
 
     Attributes:
+      space: where to train, on its target A.
       preset: what is trained.
       seeds: seeds in the program, one after another on each device.
       cores: cores that the process may use.
     """
 
+    space: Literal["grid_world", "manipulation"] = "grid_world"
     preset: Literal["paper", "fast"] = "fast"
     seeds: int = 1
     cores: int = 2
@@ -96,7 +98,8 @@ def main() -> int:
             _measure.table(["cache", *columns], rows),
         )
     )
-    _measure.report("compile_time", args, {**starts, "imports": imports}, text)
+    name = "compile_time" if args.space == "grid_world" else f"compile_time_{args.space}"
+    _measure.report(name, args, {**starts, "imports": imports}, text)
     return 0
 
 
@@ -118,7 +121,7 @@ def start(cache: Path, args: Args, *, requested: float) -> Start:
     _measure.pin(args.cores)
     runtime.setup()
     jax.config.update("jax_compilation_cache_dir", str(cache))
-    space, target, config, one = _measure.load_problem(args.preset)
+    space, target, config, one = _measure.load_problem(args.preset, space=args.space)
     program = make_program(make_trainer(space, target, config), args.seeds)
     hparams = stack_hparams([one] * args.seeds)
 

@@ -124,9 +124,9 @@ def main() -> int:
     matmuls = [time_matmul(*shape, args) for shape in (MERGE_MATMUL, LARGE_MATMUL)]
     changes = _measure.QUICK if args.quick else {}
     problems = {preset: _measure.load_problem(preset, space=args.space, **changes) for preset in args.presets}
-    results = {preset: measure(problem, args) for preset, problem in problems.items()}
+    results: dict[str, Result] = {preset: measure(problem, args) for preset, problem in problems.items()}
     rate = matmuls[0].rate
-    text = "\n".join([matmul_table(matmuls), *(tables(preset, result, rate) for preset, result in results.items())])
+    text = f"{matmul_table(matmuls)}\n{tables(results, rate)}"
     name = "training_step" if args.space == "grid_world" else f"training_step_{args.space}"
     _measure.report(name, args, {"matmuls": matmuls, "presets": results}, text)
     return 0
@@ -218,48 +218,68 @@ def matmul_table(matmuls: list[Matmul]) -> str:
     return _measure.table(["float32 matmul", "microseconds", "GFLOP/s"], rows)
 
 
-def work_table(title: str, work: Mapping[str, Work], rate: float) -> str:
-    """How much of the machine's matmul rate is reached, if all that is no matmul counts as lost time."""
-    rows = [
-        [
-            name,
-            _measure.number(one.flops / 1e6),
-            _measure.number(one.matmul_flops / 1e6),
-            _measure.number(one.matmul_flops / one.seconds / 1e9),
-            f"{one.matmul_seconds / one.seconds:.1%}",
-            f"{one.matmul_flops / one.seconds / rate:.1%}",
-        ]
-        for name, one in work.items()
-    ]
-    header = [title, "MFLOP", "in matmuls", "GFLOP/s of these", "of the rate at its own shapes", "of the first matmul's rate"]
-    return _measure.table(header, rows)
-
-
-def tables(preset: str, result: Result, rate: float) -> str:
-    """A preset's results, for people; `rate` is that of the first matmul, in operations per second."""
-    chunk, total = result.chunk, result.sum_of_parts
-    rows = [
-        [name, timing.cell(), f"{timing.median / total:.1%}", f"{timing.compile_seconds:.1f}"]
-        for name, timing in result.parts.items()
-    ]
-    training = chunk.median - result.parts["evaluate"].median
-    rows += [
-        ["sum of the parts", _measure.number(total * 1e3), "100.0%", ""],
-        ["whole chunk", chunk.cell(), f"{chunk.median / total:.1%}", f"{chunk.compile_seconds:.1f}"],
-        ["whole chunk less evaluation", _measure.number(training * 1e3), f"{training / total:.1%}", ""],
-    ]
-    pieces = {**result.models, "all of it, jointly": result.model_update}
-    alone = sum(timing.median for timing in result.models.values())
-    model_rows = [[name, timing.cell(), f"{timing.median / alone:.1%}"] for name, timing in pieces.items()]
+def tables(results: Mapping[str, Result], rate: float) -> str:
+    """The results of each preset side by side, for people; `rate` is that of the first matmul, in operations per second."""
+    sums = ", ".join(f"{r.chunk.median / r.sum_of_parts:.2f} ({preset})" for preset, r in results.items())
     return "\n".join(
         [
-            f"Preset {preset}, milliseconds per environment step, median (range):\n",
-            _measure.table([f"{preset}: part", "ms per step", "of the sum", "compile, s"], rows),
-            f"Whole / sum of the parts: {chunk.median / total:.3f}.\n",
-            _measure.table([f"{preset}: piece of a model update", "ms", "of the pieces' sum"], model_rows),
-            work_table(f"{preset}: one", result.work, rate),
+            "Milliseconds per environment step:\n",
+            side_by_side("part", ["ms", "of the sum", "compile, s"], {name: part_rows(r) for name, r in results.items()}),
+            f"Whole / sum of the parts: {sums}.\n",
+            side_by_side("piece of a model update", ["ms", "of the sum"], {name: model_rows(r) for name, r in results.items()}),
+            "What matmuls reach, all else that is done counted as time lost:\n",
+            side_by_side(
+                "one",
+                ["MFLOP in matmuls", "of the rate", "of its own shapes"],
+                {name: work_rows(r.work, rate) for name, r in results.items()},
+            ),
         ]
     )
+
+
+Rows = dict[str, list[str]]
+"""Cells by the name of their row."""
+
+
+def side_by_side(first: str, columns: Sequence[str], presets: Mapping[str, Rows]) -> str:
+    """One table of the same rows and columns of several presets."""
+    header = [first, *(f"{preset}: {column}" for preset in presets for column in columns)]
+    names = next(iter(presets.values()))
+    return _measure.table(header, [[name, *(cell for rows in presets.values() for cell in rows[name])] for name in names])
+
+
+def part_rows(result: Result) -> Rows:
+    """What the parts take, together and within the whole."""
+    chunk, total = result.chunk, result.sum_of_parts
+    training = chunk.median - result.parts["evaluate"].median
+    return {
+        **{
+            name: [timing.cell(), f"{timing.median / total:.1%}", f"{timing.compile_seconds:.1f}"]
+            for name, timing in result.parts.items()
+        },
+        "sum of the parts": [_measure.number(total * 1e3), "100.0%", ""],
+        "whole chunk": [chunk.cell(), f"{chunk.median / total:.1%}", f"{chunk.compile_seconds:.1f}"],
+        "whole chunk less evaluation": [_measure.number(training * 1e3), f"{training / total:.1%}", ""],
+    }
+
+
+def model_rows(result: Result) -> Rows:
+    """What the pieces of a model update take, each alone and all jointly."""
+    pieces = {**result.models, "all of it, jointly": result.model_update}
+    alone = sum(timing.median for timing in result.models.values())
+    return {name: [timing.cell(), f"{timing.median / alone:.1%}"] for name, timing in pieces.items()}
+
+
+def work_rows(work: Mapping[str, Work], rate: float) -> Rows:
+    """How much of the machine's matmul rate is reached, if all that is no matmul counts as lost time."""
+    return {
+        name: [
+            _measure.number(one.matmul_flops / 1e6),
+            f"{one.matmul_flops / one.seconds / rate:.1%}",
+            f"{one.matmul_seconds / one.seconds:.1%}",
+        ]
+        for name, one in work.items()
+    }
 
 
 if __name__ == "__main__":

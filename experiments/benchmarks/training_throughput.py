@@ -17,11 +17,9 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-import multiprocessing
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -32,6 +30,7 @@ import tyro
 from apt_jax.lanes import make_program, stack_hparams
 from apt_jax.trainer import Clock, make_trainer
 from experiments.benchmarks import _measure
+from experiments.benchmarks._in_turns import Begun, Worker
 from experiments.benchmarks._measure import Options, Problem, Timing
 from experiments.errors import UsageError, exit_with
 
@@ -93,8 +92,8 @@ def measure(args: Args) -> dict[str, Throughput]:
     """All sides, by their names in the table, ours first."""
     with ExitStack() as stack:
 
-        def start(begin: Callable[..., Begun], seeds: int, *details: Any) -> Worker:
-            return stack.enter_context(Worker(begin, args, *details, steps=seeds * args.steps))
+        def start(begin: Callable[..., Begun], seeds: int, *details: Any) -> tuple[Worker, int]:
+            return stack.enter_context(Worker(begin, args, *details)), seeds * args.steps
 
         # By side, who trains alone and who train together.
         sides = {OURS: (start(begin_ours, 1, 1, 1), [start(begin_ours, args.seeds, args.seeds, args.cores)])}
@@ -113,61 +112,17 @@ def measure(args: Args) -> dict[str, Throughput]:
                 seconds[name][1].append(train(together))
     return {
         name: Throughput(
-            Timing(tuple(seconds[name][0]), alone.compile_seconds),
-            Timing(tuple(seconds[name][1]), max(worker.compile_seconds for worker in together)),
+            Timing(tuple(seconds[name][0]), alone[0].compile_seconds),
+            Timing(tuple(seconds[name][1]), max(worker.compile_seconds for worker, _ in together)),
         )
         for name, (alone, together) in sides.items()
     }
 
 
-Begun = tuple[Callable[[], None], float]
-"""What trains for a measurement, and the seconds to compile it."""
-
-
-class Worker:
-    """A process of its own in which training goes on from one measurement to the next.
-
-    Args:
-      begin: makes what the process trains.
-      steps: environment steps of a measurement, of all its seeds.
-    """
-
-    def __init__(self, begin: Callable[..., Begun], *details: Any, steps: int) -> None:
-        self.steps = steps
-        self._pool = ProcessPoolExecutor(max_workers=1, mp_context=multiprocessing.get_context("spawn"))
-        self.compile_seconds = self._pool.submit(_begin, begin, *details).result()
-
-    def __enter__(self) -> Worker:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._pool.shutdown()
-
-    def train(self) -> Future[float]:
-        """The seconds of one measurement."""
-        return self._pool.submit(_train)
-
-
-_trains: list[Callable[[], None]] = []
-"""In a worker's process, what it trains."""
-
-
-def _begin(begin: Callable[..., Begun], *details: Any) -> float:
-    train, compile_seconds = begin(*details)
-    _trains.append(train)
-    return compile_seconds
-
-
-def _train() -> float:
-    began = time.perf_counter()
-    _trains[0]()
-    return time.perf_counter() - began
-
-
-def train(workers: Sequence[Worker]) -> float:
-    """Seconds per environment step of workers that train at the same time."""
-    running = [worker.train() for worker in workers]
-    return 1.0 / sum(worker.steps / seconds.result() for worker, seconds in zip(workers, running, strict=True))
+def train(workers: Sequence[tuple[Worker, int]]) -> float:
+    """Seconds per environment step of workers that train at the same time, each so many steps."""
+    running = [(worker.start(), steps) for worker, steps in workers]
+    return 1.0 / sum(steps / seconds.result() for seconds, steps in running)
 
 
 def begin_ours(args: Args, seeds: int, cores: int) -> Begun:

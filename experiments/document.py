@@ -1,0 +1,99 @@
+"""Writes the tables of BENCHMARKS.md and the figures above them anew: `python -m experiments.document`.
+
+A table stands between two comments, of which the first says what it is made of, all of it in `experiments/results`:
+
+    <!-- table: benchmark NAME -->                        what the script printed that wrote benchmarks/NAME.json
+    <!-- table: report FIGURE.png RUN [RUN ...] -->       `experiments.report` of runs; FIGURE.png is drawn
+    <!-- table: signs RUN [RUN ...] -->                   `experiments.signs` of runs
+    <!-- end of table -->
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from experiments import plots, report, signs
+from experiments.errors import UsageError, exit_with
+
+_END = "<!-- end of table -->"
+_TABLE = re.compile(rf"(?P<begin><!-- table: (?P<kind>\S+) (?P<names>[^>]*?) -->\n).*?(?P<end>{re.escape(_END)})", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Document:
+    """Fill a document's marked tables.
+
+    Attributes:
+      path: the Markdown file.
+      results: where runs and benchmarks/ are, and where figures go.
+    """
+
+    path: Path = Path("BENCHMARKS.md")
+    results: Path = Path("experiments/results")
+
+
+def main() -> int:
+    """The command line."""
+    document = tyro.cli(Document, prog="python -m experiments.document", description=__doc__)
+    if not document.path.is_file():
+        raise UsageError(f"--path {document.path} is no file")
+    before = document.path.read_text()
+    after = fill(before, document.results)
+    draw(after, document.results)
+    document.path.write_text(after)
+    print(f"{document.path}: {len(_TABLE.findall(after))} tables, {'changed' if after != before else 'as they were'}")
+    return 0
+
+
+def fill(text: str, results: Path) -> str:
+    """A document with every marked table made anew.
+
+    Raises:
+      UsageError: a mark that says nothing known, or results that are not there.
+    """
+
+    def table(match: re.Match[str]) -> str:
+        if match["kind"] not in TABLES:
+            raise UsageError(f"{match['begin'].strip()}: {match['kind']!r} must be one of {', '.join(TABLES)}")
+        return f"{match['begin']}{TABLES[match['kind']](match['names'].split(), results).strip()}\n{match['end']}"
+
+    return _TABLE.sub(table, text)
+
+
+def draw(text: str, results: Path) -> None:
+    """The figure of every marked report."""
+    for match in _TABLE.finditer(text):
+        if match["kind"] == "report":
+            figure, *runs = match["names"].split()
+            plots.comparison(results / figure, {"": report.read([results / run for run in runs])})
+
+
+def _benchmark(names: Sequence[str], results: Path) -> str:
+    (name,) = names
+    path = results / "benchmarks" / f"{name}.json"
+    if not path.is_file():
+        raise UsageError(f"{path} is not there; python -m experiments.benchmarks --only {name} writes it")
+    return "\n".join(json.loads(path.read_text())["text"])
+
+
+def _report(names: Sequence[str], results: Path) -> str:
+    _, *runs = names
+    return report.table(report.read([results / run for run in runs]))
+
+
+def _signs(names: Sequence[str], results: Path) -> str:
+    return signs.table([results / run for run in names])
+
+
+TABLES: Mapping[str, Callable[[Sequence[str], Path], str]] = {"benchmark": _benchmark, "report": _report, "signs": _signs}
+"""By the first word of a mark, the table of the other words."""
+
+
+if __name__ == "__main__":
+    exit_with(main)
