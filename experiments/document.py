@@ -21,8 +21,10 @@ import tyro
 from experiments import plots, report, signs
 from experiments.errors import UsageError, exit_with
 
-_END = "<!-- end of table -->"
-_TABLE = re.compile(rf"(?P<begin><!-- table: (?P<kind>\S+) (?P<names>[^>]*?) -->\n).*?(?P<end>{re.escape(_END)})", re.DOTALL)
+END = "<!-- end of table -->"
+"""The second comment."""
+
+_TABLE = re.compile(rf"(?P<begin><!-- table: (?P<kind>\S+) (?P<names>[^>]*?) -->\n).*?(?P<end>{re.escape(END)})", re.DOTALL)
 
 
 @dataclass(frozen=True)

@@ -258,8 +258,9 @@ def _caption(environment: Mapping[str, Any], options: Options) -> str:
     """What a reader of the tables has to know: repeats, machine, versions, commit, and what else was running."""
     packages = environment["packages"]
     versions = ", ".join(f"{name} {packages[name]}" for name in ("jax", "jaxlib", "flax", "optax", "numpy"))
+    repeats = "Measured once" if options.repeats == 1 else f"Median (range) of {options.repeats} repeats"
     return (
-        f"{options.repeats} repeats, median (range); {environment['cpu']}, {environment['cores']} cores, "
+        f"{repeats}; {environment['cpu']}, {environment['cores']} cores, "
         f"{environment['device_kind']}; {versions}; commit {(environment['git_commit'] or 'unknown')[:12]}; "
         f"load average before it began {environment['load_average'][0]:.2f}."
     )

@@ -74,7 +74,7 @@ def main() -> int:
     same, true = time_same_model(args), time_true_shapes(args)
     faults = count_faults(args.space, args.checked)
     rows = [
-        [f"MJX, {n} side by side", side.timing.rate(n), *_costs(side.timing, n), f"{side.peak_memory / 2**20:.0f}"]
+        [f"MJX, {n} side by side", side.timing.rate(n), *_costs(side.timing, n), f"{side.peak_memory / 2**20:,.0f}"]
         for n, side in sides.items()
     ]
     rows.append(["MuJoCo, same model", same.rate(), *_costs(same, 1), ""])

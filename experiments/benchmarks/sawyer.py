@@ -62,8 +62,7 @@ def main() -> int:
     """The command line."""
     args = tyro.cli(Args, prog="python -m experiments.benchmarks.sawyer")
     _measure.check(args)
-    if args.quick:
-        args = dataclasses.replace(args, pushes=2)
+    args = dataclasses.replace(args, repeats=1, pushes=2 if args.quick else args.pushes)
     results = measure(args.pushes)
     header = ["pushes", "same event", "mean distance, mm", "largest, mm", "tracking, mm", "s per push"]
     text = _measure.table(header, [_row(name, result) for name, result in results.items()])

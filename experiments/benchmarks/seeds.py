@@ -73,7 +73,8 @@ def main() -> int:
         for result in results
     ]
     header = ["layout", *(f"{seeds} seed{'s'[: seeds - 1]}" for seeds in args.seeds)]
-    text = f"Seconds per seed and 1,000 environment steps, {args.cores} cores:\n\n{_measure.table(header, rows)}"
+    cores = f"{args.cores} core{'s'[: args.cores - 1]}"
+    text = f"Seconds per seed and 1,000 environment steps, on {cores}:\n\n{_measure.table(header, rows)}"
     name = "seeds" if args.space == "grid_world" else f"seeds_{args.space}"
     _measure.report(name, args, {"arrangements": results}, text)
     return 0
