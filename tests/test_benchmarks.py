@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import json
 import math
@@ -265,23 +266,28 @@ def test_every_size_of_growth_fits_the_preset():
 
 
 @pytest.fixture(scope="module")
-def played():
+def learn():
+    """`learn(name)`: the parameters before and after an iteration's updates by a variant, on the same replay."""
     problem = _measure.Problem(Corridor(), np.int32(7), CONFIG, HParams())
-    return problem, variants.play(problem)
+    rings = variants.play(problem)
+
+    @functools.cache
+    def learn(name):
+        variant = variants.VARIANTS[name]
+        material = variants.make_material(problem, rings, widen=variant.widen)
+        state = learner.init(material.network, jax.random.key(0))
+        return state.params, jax.jit(variant.make(material))(state, rings, jax.random.key(1)).params
+
+    return learn
 
 
 @pytest.mark.parametrize("name", [name for name, variant in variants.VARIANTS.items() if not variant.flags])
-def test_a_variant_of_the_policy_update_learns(name, played):
+def test_a_variant_of_the_policy_update_learns(name, learn):
     """What draws the same batches and has the same network ends up with the same parameters."""
-    problem, rings = played
-    variant = variants.VARIANTS[name]
-    material = variants.make_material(problem, rings, widen=variant.widen)
-    state = learner.init(material.network, jax.random.key(0))
-    after = jax.jit(variant.make(material))(state, rings, jax.random.key(1))
-    assert not np.array_equal(*(jax.tree.leaves(each.params)[0] for each in (state, after)))
+    before, after = learn(name)
+    assert not np.array_equal(*(jax.tree.leaves(params)[0] for params in (before, after)))
     if name not in ("each batch sampled by itself", "inputs padded to whole registers"):
-        as_it_is = jax.jit(variants.as_it_is(material))(state, rings, jax.random.key(1))
-        chex.assert_trees_all_close(after.params, as_it_is.params, atol=1e-6)
+        chex.assert_trees_all_close(after, learn(variants.FIRST)[1], atol=1e-6)
 
 
 def test_a_variant_is_compared_turn_by_turn():
