@@ -32,6 +32,8 @@ class HParams:
       beta_max: upper bound of beta (paper: 8).
       pessimism: standard deviations of the value ensemble taken off its mean, >= 0; nothing for an ensemble of one.
       value_weight_decay: decoupled weight decay of the value networks, per unit of their learning rate, >= 0.
+      recency: how much discriminator and values prefer recent generated episodes (`replay.sample_rollouts`), >= 1; 1 draws
+        uniformly from the window (paper).
       cell_noise: probability that a cell of a generated grid is played with a uniformly drawn category, in [0, 1] (paper: 0).
       vector_noise: standard deviation of the noise on generated vectors, as a share of their range, >= 0 (paper: 0).
       vector_prior: weight of the divergence of generated vectors from a fresh generator's, which keeps numbers off the ends of
@@ -67,6 +69,7 @@ class HParams:
     beta_max: float = 8.0
     pessimism: float = 1.0
     value_weight_decay: float = 0.0
+    recency: float = 1.0
     cell_noise: float = 0.0
     vector_noise: float = 0.0
     vector_prior: float = 0.0
@@ -106,6 +109,7 @@ def check_hparams(hparams: HParams) -> None:
         "goal_old_share",
     )
     ranges = {
+        "recency": (1.0, math.inf, "at least 1"),
         "delta": (-sys.float_info.max, sys.float_info.max, "finite"),
         **dict.fromkeys(positive, (math.ulp(0.0), math.inf, "above 0")),
         **dict.fromkeys(not_negative + rates + scales, (0.0, math.inf, "at least 0")),
@@ -218,6 +222,7 @@ PRESETS: dict[str, tuple[Config, HParams]] = {
             target_rate=0.02,
             generator_learning_rate=7e-4,
             value_weight_decay=10.0,
+            recency=3.0,
             cell_noise=0.03,
             vector_noise=0.05,
             vector_prior=0.03,

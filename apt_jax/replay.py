@@ -254,19 +254,30 @@ def _draw_successes(
 
 
 def sample_rollouts(
-    replay: Replay, key: Key[Array, ""], iteration: Int[Array, ""], *, source: int, batch_size: int, steps: int, recent: int
+    replay: Replay,
+    key: Key[Array, ""],
+    iteration: Int[Array, ""],
+    *,
+    source: int,
+    batch_size: int,
+    steps: int,
+    recent: int,
+    recency: Float[Array, ""] | float,
 ) -> Rollouts:
-    """Episodes of a source that ended within the last `recent` iterations, uniformly with replacement; consumes `key`.
+    """Episodes of a source that ended within the last `recent` iterations, with replacement; consumes `key`.
 
     Args:
       iteration: the latest iteration written.
       steps: transitions drawn (with replacement) from each episode.
+      recency: of n such episodes, ordered from the latest, number floor(n u^recency) is drawn, with u uniform in [0, 1): 1
+        draws uniformly, 3 draws half from the latest eighth; at least 1.
     """
     slots = replay.episodes.end.shape[1]
     columns = replay.transitions.action.shape[2]
     key_episode, key_step = jax.random.split(key)
     count = jnp.sum(replay.episodes.end[source] > iteration - recent, dtype=jnp.int32)
-    back = jax.random.randint(key_episode, (batch_size,), 0, jnp.maximum(count, 1))
+    share = jax.random.uniform(key_episode, (batch_size,)) ** recency
+    back = jnp.minimum((share * count.astype(jnp.float32)).astype(jnp.int32), jnp.maximum(count - 1, 0))
     slot = (replay.finished[source] - 1 - back) % slots
     picked = jax.tree.map(lambda ring: ring[source, slot], replay.episodes)
     start = picked.end - picked.length + 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import collections
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -194,7 +196,14 @@ def test_sampled_rollouts_are_consistent_episodes_within_the_window():
     rings, finished = _written(iterations)
     for source in range(SOURCES):
         rollouts = replay.sample_rollouts(
-            rings, jax.random.key(2), jnp.int32(iterations - 1), source=source, batch_size=256, steps=5, recent=recent
+            rings,
+            jax.random.key(2),
+            jnp.int32(iterations - 1),
+            source=source,
+            batch_size=256,
+            steps=5,
+            recent=recent,
+            recency=1.0,
         )
         eligible = {(e, end): (n, r) for e, end, n, r in finished[source][-SLOTS:] if end > iterations - 1 - recent}
         rollouts = jax.tree.map(np.asarray, rollouts)
@@ -211,6 +220,22 @@ def test_sampled_rollouts_are_consistent_episodes_within_the_window():
             steps = rollouts.steps.reward[b]
             assert ((first <= steps) & (steps < first + length)).all()
         assert seen == set(eligible)
+
+
+@pytest.mark.parametrize("recency", [1.0, 3.0])
+def test_recent_episodes_are_drawn_as_often_as_is_asked(recency):
+    """Of n episodes number k from the latest on is drawn if u^recency is in [k/n, (k+1)/n)."""
+    rings, finished = _written(41)
+    drawn = 20_000
+    rollouts = replay.sample_rollouts(
+        rings, jax.random.key(3), jnp.int32(40), source=1, batch_size=drawn, steps=1, recent=30, recency=recency
+    )
+    latest = [(env, end) for env, end, *_ in finished[1][-SLOTS:] if end > 10][::-1]
+    w = np.asarray(rollouts.w["p"][:, 0])
+    counts = collections.Counter(zip((w % 10_000 // 100).astype(int).tolist(), (w % 100).astype(int).tolist(), strict=True))
+    edges = (np.arange(len(latest) + 1) / len(latest)) ** (1 / recency)
+    assert len(latest) > 4
+    np.testing.assert_allclose([counts[episode] / drawn for episode in latest], np.diff(edges), atol=0.02)
 
 
 def test_recent_outcome_is_the_mean_of_the_last_episodes_only():

@@ -133,6 +133,7 @@ def rollouts_of(sides, source):
         batch_size=config.model_batch_size,
         steps=config.rollout_steps,
         recent=config.recent_steps // config.envs_per_source,
+        recency=1.0,
     )
     steps = ours.steps
     theirs = tensors(
@@ -286,14 +287,15 @@ def test_transitions_are_drawn_alike(sides):
             assert_same_distribution(theirs.next_obs[name][half], ours.next_obs[name][0, half])
 
 
-@pytest.mark.parametrize("source", [TARGET, GENERATED])
-def test_rollouts_are_drawn_alike(sides, source):
+@pytest.mark.parametrize(("source", "recency"), [(TARGET, 1.0), (GENERATED, 3.0)])
+def test_rollouts_are_drawn_alike(sides, source, recency):
     config = sides.config
     arguments = {
         "source": source,
         "batch_size": 4_000,
         "steps": config.rollout_steps,
         "recent": config.recent_steps // config.envs_per_source,
+        "recency": recency,
     }
     ours = replay.sample_rollouts(sides.state.replay, jax.random.key(9), sides.iteration, **arguments)
     theirs = their_replay(sides, seed=1).sample_rollouts(int(sides.iteration), **arguments)

@@ -95,7 +95,7 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
     ) -> tuple[AptGenState, Metrics]:
         key_target, key_generated, key_z = jax.random.split(key, 3)
 
-        def sample(key: Key[Array, ""], source: int) -> rp.Rollouts:
+        def sample(key: Key[Array, ""], source: int, recency: Float[Array, ""] | float) -> rp.Rollouts:
             return rp.sample_rollouts(
                 replay,
                 key,
@@ -104,9 +104,10 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
                 batch_size=batch,
                 steps=config.rollout_steps,
                 recent=recent,
+                recency=recency,
             )
 
-        target, generated = sample(key_target, TARGET), sample(key_generated, GENERATED)
+        target, generated = sample(key_target, TARGET, 1.0), sample(key_generated, GENERATED, hparams.recency)
         z = noise(key_z, batch)
 
         def loss(models: Models) -> tuple[Float[Array, ""], tuple[Any, Any, Metrics]]:

@@ -136,7 +136,7 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
     models = fresh.models
 
     def sample(_: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
-        def rollouts(key: Key[Array, ""], source: int) -> replay.Rollouts:
+        def rollouts(key: Key[Array, ""], source: int, recency: Float[Array, ""] | float) -> replay.Rollouts:
             return replay.sample_rollouts(
                 fixed,
                 key,
@@ -145,10 +145,11 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
                 batch_size=config.model_batch_size,
                 steps=config.rollout_steps,
                 recent=config.recent_steps // config.envs_per_source,
+                recency=recency,
             )
 
         key_target, key_generated = jax.random.split(key)
-        return (), (rollouts(key_target, TARGET), rollouts(key_generated, GENERATED))
+        return (), (rollouts(key_target, TARGET, 1.0), rollouts(key_generated, GENERATED, hparams.recency))
 
     def optimise(loss: Callable[[Any], tuple[Float[Array, ""], Any]], params: Any, opt_state: Any) -> Any:
         grads, aux = jax.grad(loss, has_aux=True)(params)

@@ -156,8 +156,9 @@ class Training:
                     batch_size=config.model_batch_size,
                     steps=config.rollout_steps,
                     recent=config.recent_steps // config.envs_per_source,
+                    recency=recency,
                 )
-                for source in (TARGET, GENERATED)
+                for source, recency in ((TARGET, 1.0), (GENERATED, self.hparams.recency))
             )
             self.models.update(target, generated, beta=self.beta)
 

@@ -139,10 +139,13 @@ class Replay:
             step[:of_successes] = self.end[source, slot] - self.rng.integers(self.length[source, slot])
         return env, step
 
-    def sample_rollouts(self, iteration: int, *, source: int, batch_size: int, steps: int, recent: int) -> Rollouts:
+    def sample_rollouts(
+        self, iteration: int, *, source: int, batch_size: int, steps: int, recent: int, recency: float
+    ) -> Rollouts:
         """Episodes of a source that ended within the last `recent` iterations, and `steps` of the steps of each."""
-        count = max(int(np.sum(self.end[source] > iteration - recent)), 1)
-        slot = (self.finished[source] - 1 - self.rng.integers(count, size=batch_size)) % self.env.shape[1]
+        count = int(np.sum(self.end[source] > iteration - recent))
+        back = (self.rng.random(batch_size) ** recency * count).astype(int)
+        slot = (self.finished[source] - 1 - back) % self.env.shape[1]
         length = self.length[source, slot]
         start = self.end[source, slot] - length + 1
         env = self.env[source, slot]
