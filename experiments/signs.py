@@ -26,7 +26,7 @@ HEADER = (
     "V1's correlation",
     "V2's correlation",
     "V2's bias, policy frozen",
-    "V2's bias, policy learning (root mean square)",
+    "V2's bias, policy learning (root mean square; correlation over time)",
 )
 
 
@@ -108,9 +108,13 @@ def row(
 
 
 def error(expected: Float[np.ndarray, "T"], returned: Float[np.ndarray, "T"]) -> str:
-    """Mean of what was expected less what was returned, and the root of its mean square."""
+    """Mean of what was expected less what was returned, the root of its mean square, and the correlation of the two."""
+    known = np.isfinite(expected) & np.isfinite(returned)
+    expected, returned = expected[known], returned[known]
     difference = expected - returned
-    return f"{np.nanmean(difference):+.2f} ({np.sqrt(np.nanmean(difference**2)):.2f})"
+    # A curve that does not move has no correlation.
+    correlation = np.corrcoef(expected, returned)[0, 1] if expected.std() > 0 and returned.std() > 0 else np.nan
+    return f"{difference.mean():+.2f} ({np.sqrt((difference**2).mean()):.2f}; {correlation:.2f})"
 
 
 def over_time(env_steps: Int[np.ndarray, "T"], values: Float[np.ndarray, "T"] | None, digits: int) -> str:

@@ -31,11 +31,11 @@ def test_a_row_averages_what_lies_after_the_given_step():
         "generator_return": np.where(late, 0.25, 9.0),
     }
     row = signs.row("run", 3, env_steps, curves, 4_000, {"beta_min": 0.125, "beta_max": 8.0})
-    assert row == "| run | 3 | 0.50 (0.50 to 0.50) | 50%, 25% | - | - | - | - | 0.25 | -0.50 | +0.10 | -0.25 (0.25) |"
+    assert row == "| run | 3 | 0.50 (0.50 to 0.50) | 50%, 25% | - | - | - | - | 0.25 | -0.50 | +0.10 | -0.25 (0.25; nan) |"
 
 
-def test_error_has_a_mean_and_a_size_and_skips_gaps():
-    assert signs.error(np.array([0.5, 0.5, 9.0]), np.array([0.2, 0.6, np.nan])) == "+0.10 (0.22)"
+def test_error_has_a_mean_a_size_and_a_correlation_and_skips_gaps():
+    assert signs.error(np.array([0.6, 0.4, 9.0]), np.array([0.2, 0.6, np.nan])) == "+0.10 (0.32; -1.00)"
 
 
 @pytest.mark.parametrize("module", [signs, report])
