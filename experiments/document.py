@@ -2,7 +2,7 @@
 
 A table stands between two comments, of which the first says what it is made of, all of it in `experiments/results`:
 
-    <!-- table: benchmark NAME -->                        what the script printed that wrote benchmarks/NAME.json
+    <!-- table: benchmark NAME [NAME ...] -->             what the scripts printed that wrote benchmarks/NAME.json
     <!-- table: report FIGURE.png RUN [RUN ...] -->       `experiments.report` of runs; FIGURE.png is drawn
     <!-- table: signs RUN [RUN ...] -->                   `experiments.signs` of runs
     <!-- end of table -->
@@ -24,7 +24,10 @@ from experiments.errors import UsageError, exit_with
 END = "<!-- end of table -->"
 """The second comment."""
 
-_TABLE = re.compile(rf"(?P<begin><!-- table: (?P<kind>\S+) (?P<names>[^>]*?) -->\n).*?(?P<end>{re.escape(END)})", re.DOTALL)
+_MARK = "<!-- table: "
+_TABLE = re.compile(
+    rf"(?P<begin>{_MARK}(?P<kind>\S+) (?P<names>[^>]*?) -->\n)(?:(?!{_MARK}).)*?(?P<end>{re.escape(END)})", re.DOTALL
+)
 
 
 @dataclass(frozen=True)
@@ -57,8 +60,14 @@ def fill(text: str, results: Path) -> str:
     """A document with every marked table made anew.
 
     Raises:
-      UsageError: a mark that says nothing known, or results that are not there.
+      UsageError: a mark that says nothing known or has no end, an end without a mark, or results that are not there.
     """
+    tables = len(_TABLE.findall(text))
+    if not tables == text.count(_MARK) == text.count(END):
+        raise UsageError(
+            f"{text.count(_MARK)} comments begin a table and {text.count(END)} end one, but only {tables} pairs read "
+            f"{_MARK}KIND NAME [NAME ...] -->, on a line of its own, and {END}"
+        )
 
     def table(match: re.Match[str]) -> str:
         if match["kind"] not in TABLES:
@@ -77,11 +86,15 @@ def draw(text: str, results: Path) -> None:
 
 
 def _benchmark(names: Sequence[str], results: Path) -> str:
-    (name,) = names
-    path = results / "benchmarks" / f"{name}.json"
-    if not path.is_file():
-        raise UsageError(f"{path} is not there; python -m experiments.benchmarks --only {name} writes it")
-    return "\n".join(json.loads(path.read_text())["text"])
+    texts = []
+    for path in (results / "benchmarks" / f"{name}.json" for name in names):
+        if not path.is_file():
+            raise UsageError(f"{path} is not there; python -m experiments.benchmarks writes it")
+        content = json.loads(path.read_text())
+        if content["settings"]["quick"]:
+            raise UsageError(f"{path} was measured with --quick, its numbers mean nothing")
+        texts.append("\n".join(content["text"]))
+    return "\n\n".join(texts)
 
 
 def _report(names: Sequence[str], results: Path) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -38,7 +39,7 @@ def describe() -> dict[str, object]:
     devices = jax.devices()
     return {
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in _PACKAGES},
+        "packages": versions(_PACKAGES),
         "device_kind": devices[0].device_kind,
         "devices": len(devices),
         "processes": jax.process_count(),
@@ -51,11 +52,13 @@ def git_commit() -> str | None:
     git = ["git", "-C", str(Path(__file__).parent.parent)]
     code = [".", ":(exclude)*.md", ":(exclude)experiments/results"]
     try:
-        commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
-        same = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", *code], capture_output=True, check=False).returncode == 0
+        commit, changes = (
+            subprocess.run([*git, *words], capture_output=True, text=True, check=True).stdout.strip()
+            for words in (("rev-parse", "HEAD"), ("status", "--porcelain", "--", *code))
+        )
     except (OSError, subprocess.CalledProcessError):  # no git, or not a checkout
         return None
-    return commit if same else f"{commit}-dirty"
+    return f"{commit}-dirty" if changes else commit
 
 
 def _cores() -> int:
@@ -66,8 +69,13 @@ def _cache_root() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
 
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:  # run from a checkout that is not installed
-        return None
+def versions(packages: Sequence[str] = _PACKAGES) -> dict[str, str | None]:
+    """The installed version of each package, None of one that is missing, by default of those that a run depends on."""
+
+    def version(package: str) -> str | None:
+        try:
+            return metadata.version(package)
+        except metadata.PackageNotFoundError:
+            return None
+
+    return {package: version(package) for package in packages}

@@ -192,7 +192,7 @@ def test_a_script_writes_its_numbers_and_what_they_need_to_be_read(tmp_path):
     assert "| 10,000 |" in done.stdout
     content = json.loads(out.read_text())
     assert content["benchmark"] == "capacity"
-    assert {"python", "packages", "device_kind", "cpu", "cores", "load_average", "git_commit"} <= set(content["environment"])
+    assert {"python", "packages", "device_kind", "cpu", "cores", "busy", "peers", "git_commit"} <= set(content["environment"])
     assert "out" not in content["settings"]
     for timing in content["results"]["per_step"].values():
         assert math.isfinite(sum(timing["seconds"]))

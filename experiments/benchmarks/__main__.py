@@ -1,6 +1,7 @@
 """Every benchmark, one after another: `python -m experiments.benchmarks`, or `make bench`.
 
-Stop at any moment and repeat the command: what was measured at this commit is kept.  Nothing else should run meanwhile.
+Stop at any moment and repeat the command: what was measured at this commit, on this machine and with these packages is kept.
+Nothing else should run meanwhile.
 """
 
 from __future__ import annotations
@@ -11,10 +12,11 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
-from experiments import runtime
+from experiments.benchmarks import _measure
 from experiments.errors import UsageError, exit_with
 
 RUNS: Mapping[str, tuple[str, ...]] = {
@@ -37,6 +39,9 @@ RUNS: Mapping[str, tuple[str, ...]] = {
 }
 """By the name of its results a script of this folder and its options."""
 
+BUSY = 0.1
+"""Share of the machine's time that others may take."""
+
 
 @dataclass(frozen=True)
 class Benchmarks:
@@ -44,12 +49,12 @@ class Benchmarks:
 
     Attributes:
       only: names of results, by default all.
-      out: where NAME.json of each goes.
+      out: where NAME.json of each goes; by default what BENCHMARKS.md is made of, or runs/benchmarks if `quick`.
       quick: everything tiny, to see that the scripts run; the timings mean nothing.
     """
 
     only: tuple[str, ...] = ()
-    out: Path = Path("experiments/results/benchmarks")
+    out: Path | None = None
     quick: bool = False
 
 
@@ -58,13 +63,18 @@ def main() -> int:
     benchmarks = tyro.cli(Benchmarks, prog="python -m experiments.benchmarks", description=__doc__)
     if unknown := [name for name in benchmarks.only if name not in RUNS]:
         raise UsageError(f"--only must be among {', '.join(RUNS)}; got {', '.join(unknown)}")
-    commit = runtime.git_commit()
+    folder = benchmarks.out or Path("runs/benchmarks" if benchmarks.quick else "experiments/results/benchmarks")
+    here = _measure.conditions()
     for name in benchmarks.only or RUNS:
-        out = benchmarks.out / f"{name}.json"
-        if measured_at(out, benchmarks.quick) == commit and commit and not commit.endswith("-dirty"):
-            print(f"== {name}: kept, measured at this commit", flush=True)
+        out = folder / f"{name}.json"
+        if is_measured(out, here, benchmarks.quick):
+            print(f"== {name}: kept, measured under the same conditions", flush=True)
             continue
         print(f"== {name}", flush=True)
+        if (busy := _measure.busy_share()) > BUSY:
+            print(
+                f"warning: something else keeps the machine busy ({busy:.0%}); the timings will not be comparable", flush=True
+            )
         script, *options = RUNS[name]
         command = [sys.executable, "-m", f"experiments.benchmarks.{script}", *options, "--out", str(out)]
         if code := subprocess.run([*command, "--quick"] if benchmarks.quick else command, check=False).returncode:
@@ -72,13 +82,14 @@ def main() -> int:
     return 0
 
 
-def measured_at(out: Path, quick: bool) -> str | None:
-    """The commit whose results are in a file, None if there are none of this size."""
-    if not out.is_file():
-        return None
+def is_measured(out: Path, here: Mapping[str, Any], quick: bool) -> bool:
+    """Whether a file has results of this size from this commit, machine and these packages."""
+    commit = here["git_commit"]
+    if not out.is_file() or not commit or commit.endswith("-dirty"):
+        return False
     content = json.loads(out.read_text())
-    commit: str | None = content["environment"]["git_commit"]
-    return commit if content["settings"]["quick"] == quick else None
+    same: bool = {name: content["environment"].get(name) for name in here} == here
+    return same and content["settings"]["quick"] == quick
 
 
 if __name__ == "__main__":

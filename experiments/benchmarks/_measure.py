@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import multiprocessing
 import os
 import platform
@@ -14,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from importlib import metadata
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
@@ -32,9 +33,8 @@ F = TypeVar("F")
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_LOAD_AVERAGE = os.getloadavg()
-"""Before the benchmark starts: above zero, something else was running and the timings are not to be trusted."""
-
+PEERS = ("gymnasium", "minigrid", "xminigrid", "navix", "gymnax", "rejax", "stable-baselines3", "torch")
+"""Packages that benchmarks compare with."""
 
 QUICK: dict[str, Any] = {
     "warmup_steps": 500,
@@ -110,7 +110,8 @@ def load_problem(preset: str, *, space: str = "grid_world", **changes: Any) -> P
 
 
 def check(options: Options) -> None:
-    """Raises a `UsageError` for options that cannot be."""
+    """To be called first: takes down the conditions; raises a `UsageError` for options that cannot be."""
+    _at_start()
     if options.repeats < 1:
         raise UsageError(f"--repeats must be at least 1, got {options.repeats}")
 
@@ -208,18 +209,6 @@ def peak_memory() -> int:
     return peak if sys.platform == "darwin" else 1024 * peak
 
 
-def versions(packages: Sequence[str]) -> dict[str, str | None]:
-    """The installed version of each package, None of one that is missing."""
-
-    def version(package: str) -> str | None:
-        try:
-            return metadata.version(package)
-        except metadata.PackageNotFoundError:
-            return None
-
-    return {package: version(package) for package in packages}
-
-
 def number(value: float) -> str:
     """Three significant digits, never in exponential form."""
     return f"{float(f'{value:.3g}'):,.12g}"
@@ -236,11 +225,15 @@ def result_path(name: str, options: Options) -> Path:
     return options.out or Path("runs") / "benchmarks" / f"{name}.json"
 
 
-def report(name: str, options: Options, results: Mapping[str, Any], text: str) -> None:
-    """Prints the tables and writes them with the raw numbers and all that is needed to read these."""
-    environment = {**runtime.describe(), "cpu": _cpu_model(), "cores": os.cpu_count(), "load_average": _LOAD_AVERAGE}
+def report(name: str, options: Options, results: Mapping[str, Any], text: str, *, peers: Sequence[str] = ()) -> None:
+    """Prints the tables and writes them with the raw numbers and all that is needed to read these.
+
+    Args:
+      peers: packages of `PEERS` that ours is compared with.
+    """
+    environment = {**runtime.describe(), **_at_start()}
     settings = {key: value for key, value in dataclasses.asdict(options).items() if key != "out"}
-    text = f"{text.strip()}\n\n{_caption(environment, options)}"
+    text = f"{text.strip()}\n\n{_caption(environment, options, peers)}"
     content = {
         "benchmark": name,
         "settings": settings,
@@ -254,16 +247,49 @@ def report(name: str, options: Options, results: Mapping[str, Any], text: str) -
     print(f"{text}\n\nRaw numbers: {path}")
 
 
-def _caption(environment: Mapping[str, Any], options: Options) -> str:
+def _caption(environment: Mapping[str, Any], options: Options, peers: Sequence[str]) -> str:
     """What a reader of the tables has to know: repeats, machine, versions, commit, and what else was running."""
-    packages = environment["packages"]
-    versions = ", ".join(f"{name} {packages[name]}" for name in ("jax", "jaxlib", "flax", "optax", "numpy"))
+    packages = {**environment["packages"], **environment["peers"]}
+    named = ("jax", "jaxlib", "flax", "optax", "numpy", *peers)
+    versions = ", ".join(f"{name} {packages[name]}" for name in named if packages[name])
     repeats = "Measured once" if options.repeats == 1 else f"Median (range) of {options.repeats} repeats"
     return (
         f"{repeats}; {environment['cpu']}, {environment['cores']} cores, "
         f"{environment['device_kind']}; {versions}; commit {(environment['git_commit'] or 'unknown')[:12]}; "
-        f"load average before it began {environment['load_average'][0]:.2f}."
+        f"{environment['busy']:.0%} of the machine busy before it began."
     )
+
+
+@cache
+def _at_start() -> dict[str, Any]:
+    """Conditions as at the first call: later commits are not what is measured, and later work is the benchmark's own."""
+    return {**conditions(), "busy": busy_share()}
+
+
+def conditions() -> dict[str, Any]:
+    """What two measurements have to have in common to be compared: code, machine, packages."""
+    return {
+        "git_commit": runtime.git_commit(),
+        "cpu": _cpu_model(),
+        "cores": os.cpu_count(),
+        "packages": runtime.versions(),
+        "peers": runtime.versions(PEERS),
+    }
+
+
+def busy_share(seconds: float = 1.0) -> float:
+    """Share of all cores' time that others use while this process sleeps; NaN where the system does not tell."""
+
+    def times() -> tuple[int, int]:
+        user, nice, system, idle, wait, *rest = map(int, Path("/proc/stat").read_text().split("\n")[0].split()[1:])
+        return idle + wait, user + nice + system + idle + wait + sum(rest[:3])
+
+    if not Path("/proc/stat").is_file():
+        return math.nan
+    idle, total = times()
+    time.sleep(seconds)
+    idle_after, total_after = times()
+    return 1.0 - (idle_after - idle) / max(total_after - total, 1)
 
 
 def _cpu_model() -> str:

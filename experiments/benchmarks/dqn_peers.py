@@ -73,8 +73,7 @@ def main() -> int:
     if args.quick:
         args = dataclasses.replace(args, repeats=2, steps=20)
     results = {name: measure(args) for name, measure in SIDES.items()}
-    versions = _measure.versions(PEERS)
-    _measure.report("dqn_peers", args, {"versions": versions, "per_step": results}, table(results, args.updates))
+    _measure.report("dqn_peers", args, {"per_step": results}, table(results, args.updates), peers=PEERS)
     return 0
 
 

@@ -91,8 +91,7 @@ def main() -> int:
             print(f"left out: {name} ({error})")
             continue
         walks[name] = walk(world, args) if isinstance(world, JaxWorld) else walk_in_python(world, args)
-    results = {"versions": _measure.versions(PEERS), "walks": walks}
-    _measure.report("environments", args, results, tables(walks, args.batches))
+    _measure.report("environments", args, {"walks": walks}, tables(walks, args.batches), peers=PEERS)
     return 0
 
 

@@ -83,8 +83,7 @@ def main() -> int:
         print("left out: PyTorch (not installed)")
         args = dataclasses.replace(args, peers=())
     results = measure(args)
-    content = {"versions": _measure.versions(["torch"]), "sides": results}
-    _measure.report("training_throughput", args, content, table(results, args))
+    _measure.report("training_throughput", args, {"sides": results}, table(results, args), peers=("torch",))
     return 0
 
 

@@ -51,13 +51,11 @@ class Args(Options):
     Attributes:
       space: where to train.
       only: names of variants beside the first, by default all.
-      core: the core to run on, from 0.
       iterations: of training, each with as many updates as the preset has, per measurement.
     """
 
     space: Literal["grid_world", "manipulation"] = "grid_world"
     only: tuple[str, ...] = ()
-    core: int = 0
     iterations: int = 50
 
 
@@ -234,7 +232,8 @@ def _wide(modality: Modality) -> Modality:
         case Vector():
             return dataclasses.replace(modality, size=-(-modality.size // LANES) * LANES)
         case Grid():
-            return dataclasses.replace(modality, width=modality.width + modality.width % 2, categories=4)
+            categories = -(-modality.categories // 4) * 4
+            return dataclasses.replace(modality, width=-(-modality.width // 4) * 4, categories=categories)
     return modality
 
 
@@ -285,7 +284,7 @@ def begin(name: str, rings: Replay, args: Args) -> Begun:
     """A variant on one core, with a replay from another process."""
     variant = VARIANTS[name]
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {variant.flags}".strip()
-    _measure.pin(1, first=args.core)
+    _measure.pin(1)
     # No compilation cache: the seconds to compile are results too.
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_num_cpu_devices", 1)
@@ -382,6 +381,7 @@ def main() -> int:
     if args.quick:
         args = dataclasses.replace(args, repeats=2, iterations=1, only=args.only or tuple(VARIANTS)[1:2])
     names = [FIRST, *(name for name in args.only or VARIANTS if name != FIRST)]
+    jax.config.update("jax_platforms", "cpu")
     problem = load_problem(args)
     rings = play(problem)
     with ExitStack() as stack:
@@ -392,7 +392,8 @@ def main() -> int:
                 seconds[name].append(worker.run() / args.iterations)
     timings = {name: Timing(tuple(seconds[name]), worker.compile_seconds) for name, worker in workers.items()}
     text = table(timings, problem.config.updates_per_step * SOURCES * problem.config.envs_per_source)
-    _measure.report("variants", args, {"per_iteration": timings}, text)
+    name = "variants" if args.space == "grid_world" else f"variants_{args.space}"
+    _measure.report(name, args, {"per_iteration": timings}, text)
     return 0
 
 
