@@ -10,6 +10,9 @@ from typing import Literal
 
 import flax.struct
 
+Covariance = Literal["full", "diagonal"]
+"""Of ALP-GMM's components."""
+
 
 @flax.struct.dataclass
 class HParams:
@@ -190,7 +193,7 @@ class Config:
     alp_window: int = 250
     alp_history: int = 2_000
     alp_fit_every: int = 5_000
-    alp_covariance: Literal["full", "diagonal"] = "full"
+    alp_covariance: Covariance = "full"
     goal_rollouts: int = 2
     goal_tasks: int = 100
     goal_memory: int = 1_000

@@ -71,7 +71,8 @@ def make_program(
 
     Raises:
       ValueError: fewer than one lane, or than one at once, or fewer lanes than processes, or several processes with more lanes
-        than there is room for.
+        than there is room for,
+        or no CPU among JAX's platforms where lanes take turns.
     """
     if lanes < 1 or (at_once is not None and at_once < 1):
         raise ValueError(f"a program needs at least one lane and one at once, got {lanes} and {at_once}")
@@ -80,6 +81,13 @@ def make_program(
         group = resident * len(used)
         if len({device.process_index for device in used}) > 1:
             raise ValueError(f"the devices have room for {group} lanes, got {lanes}: take more hosts, or fewer seeds at a time")
+        try:
+            jax.devices("cpu")
+        except RuntimeError as error:
+            raise ValueError(
+                f"the devices have room for {group} lanes, got {lanes}, and the others cannot wait in the host's memory: "
+                "JAX_PLATFORMS leaves the CPU out; add it, as in JAX_PLATFORMS=cuda,cpu"
+            ) from error
         program = make_program(trainer, group, layout=layout, at_once=at_once, devices=used)
         mesh = Mesh(np.array(used), ("lane",))
         return Program(*(Turns(function, lanes, group, mesh) for function in program))

@@ -1,7 +1,8 @@
 """What was experienced: a ring of transitions per environment and a ring of finished episodes per source.
 
 All sources write one column of the transition ring per iteration, at the same unbatched position, so that a write is one
-in-place `dynamic_update_slice` and an episode lies contiguously (modulo the capacity) in its environment's row.
+in-place `dynamic_update_slice` (under `vmap` a scatter, in place too) and an episode lies contiguously (modulo the capacity) in
+its environment's row.
 
 Axes: S sources, E environments per source, T columns, N episode slots.
 """

@@ -334,6 +334,10 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
         f"model_updates_per_step must give a whole number of updates per iteration of {steps} steps, got {rounds:g}",
     )
     require(
+        not learns or (config.model_batch_size >= 2 and config.model_batch_size % sources == 0),
+        f"model_batch_size must be at least 2 and a multiple of the {sources} sources, got {config.model_batch_size}",
+    )
+    require(
         config.recent_steps >= longest,
         f"recent_steps must hold one horizon of every environment: at least {longest}, got {config.recent_steps}",
     )
@@ -353,10 +357,16 @@ def check_target(space: TaskSpace, target: Any) -> None:
     """Check that a target is a task of the shapes and dtypes that the space's tasks have.
 
     Raises:
-      ValueError: where it differs; or a space with more actions than the replay can store.
+      ValueError: where it differs; or a space with more actions or categories to observe than the replay can store.
     """
-    if space.num_actions > 256:
-        raise ValueError(f"num_actions must be at most 256, got {space.num_actions}")
+    sizes = {"num_actions": space.num_actions} | {
+        f"obs_spec[{name!r}].categories": modality.categories
+        for name, modality in space.obs_spec.items()
+        if not isinstance(modality, Vector)
+    }
+    for name, size in sizes.items():
+        if size > 256:
+            raise ValueError(f"{name} must be at most 256, got {size}")
     expected = jax.eval_shape(space.instantiate, param_struct(space.param_spec))
     given = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, target))
     if given != expected:

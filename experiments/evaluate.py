@@ -65,7 +65,7 @@ def evaluate(args: Args) -> None:
         experiment = dataclasses.replace(experiment, target=target, target_file=file)
     problem = make_problem(experiment)
     states, clock, _ = load_lanes(args.run_dir, experiment, problem.trainer)
-    policies = states.learner.target_params
+    policies = jax.device_put(states.learner.target_params, jax.local_devices()[0])
     key_score, key_film = jax.random.split(jax.random.key(args.seed))
     outcome = episodes.score(problem.trainer, policies, problem.target, episodes=args.episodes, key=key_score)
     names = [lane.name for lane in experiment.lanes]

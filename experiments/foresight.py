@@ -92,7 +92,7 @@ def main() -> int:
     if not experiment.config.method.startswith("apt_gen"):
         raise UsageError(f"{args.run_dir} is no run of apt_gen but of {experiment.config.method}")
     trainer = make_problem(experiment).trainer
-    states, clock, hparams = load_lanes(args.run_dir, experiment, trainer)
+    states, clock, hparams = jax.device_put(load_lanes(args.run_dir, experiment, trainer), jax.local_devices()[0])
     names = [lane.name for lane in experiment.lanes]
     print(f"{args.run_dir} after {int(clock.env_steps):,} steps; {args.periods} periods of {trainer.config.eval_every:,}\n")
     periods = []

@@ -95,9 +95,9 @@ def make(space: TaskSpace, config: Config, *, target: str) -> Curriculum:
         return jax.tree.map(lambda x: x[task], ladder.w)
 
     def refresh(
-        state: Int[Array, ""], key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
+        state: Int[Array, ""], key: Key[Array, ""], replay: Replay, iterations: Int[Array, ""], hparams: HParams
     ) -> Int[Array, ""]:
-        del key, iteration, hparams
+        del key, iterations, hparams
         episodes, earlier = latest_episodes(replay, source=GENERATED, count=config.return_window)
         steps = jax.vmap(lambda w: solution_length(place(w)))(episodes.w)
         here = (earlier >= 0) & (steps == jnp.asarray(ladder.steps)[state])

@@ -54,7 +54,14 @@ def main() -> int:
 
 
 def read(paths: Sequence[Path]) -> dict[str, plots.Run]:
-    """Metrics of every run and setting, by name; raises a `UsageError` for a directory without any."""
+    """Metrics of every run and setting, by name.
+
+    Raises:
+      UsageError: no evaluation yet, or two runs of one name.
+    """
+    names = [path.name for path in paths]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise UsageError(f"--runs are called by the names of their directories, which must differ: {', '.join(sorted(twice))}")
     return {name: run for path in paths for name, run in read_parts(path.name, [path]).items()}
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,10 +22,11 @@ from scipy import stats
 
 from apt_jax import evaluation, learner
 from apt_jax.config import HParams
+from apt_jax.curricula.apt_gen import AptGenState
 from apt_jax.curricula.apt_gen_objectives import make_objectives
 from apt_jax.networks import QNetwork, spectral_normalize
 from apt_jax.specs import Obs, Params
-from apt_jax.trainer import Trainer, TrainState
+from apt_jax.trainer import Trainer
 from experiments import runtime, settings
 from experiments.errors import UsageError, check_folder, exit_with
 from experiments.ladder import Ladder, build
@@ -87,7 +88,10 @@ def main() -> int:
     ladder = build(problem.target)
     states, clock, hparams = load_lanes(args.run_dir, experiment, problem.trainer)
     lanes = len(experiment.lanes)
-    judged = judge(problem.trainer, states, hparams, choose(ladder, args.tasks, args.seed), jax.random.key(args.seed))
+    policies, curricula = jax.device_put((states.learner.target_params, states.curriculum), jax.local_devices()[0])
+    judged = judge(
+        problem.trainer, policies, curricula, hparams, choose(ladder, args.tasks, args.seed), jax.random.key(args.seed)
+    )
     judged = jax.tree.map(lambda x: np.asarray(x).reshape(lanes, len(ladder.steps), args.tasks), judged)
     print(f"{args.run_dir} after {int(clock.env_steps):,} steps; means over lanes and tasks\n")
     print(table(ladder, judged))
@@ -104,20 +108,22 @@ def choose(ladder: Ladder, tasks: int, seed: int) -> Params:
     return jax.tree.map(lambda x: x[chosen.reshape(-1)], ladder.w)
 
 
-def judge(trainer: Trainer, states: TrainState, hparams: HParams, w: Params, key: Key[Array, ""]) -> Judgement:
+def judge(
+    trainer: Trainer, policies: Any, curricula: AptGenState, hparams: HParams, w: Params, key: Key[Array, ""]
+) -> Judgement:
     """Plays tasks w (leaves [n, ...]) by the policy of every lane and asks its models: leaves [L, n]; consumes `key`."""
     space = trainer.space
     network = QNetwork(space.obs_spec, space.num_actions)
     objectives = make_objectives(space, trainer.config)
     key_play, key_steps = jax.random.split(key)
 
-    def of_lane(state: TrainState, hparams: HParams, w: Params) -> Judgement:
+    def of_lane(policy: Any, curriculum: AptGenState, hparams: HParams, w: Params) -> Judgement:
         def act(obs: Obs, key: Key[Array, ""]) -> Int[Array, "n"]:
-            return learner.epsilon_greedy(network, state.learner.target_params, obs, key, hparams.epsilon_end)
+            return learner.epsilon_greedy(network, policy, obs, key, hparams.epsilon_end)
 
         outcome, transitions = evaluation.play(space, jax.vmap(space.instantiate)(w), act, key_play)
         rollouts = evaluation.sample_rollouts(w, outcome, transitions, key_steps, steps=STEPS_SEEN)
-        models, spectral = state.curriculum.models, state.curriculum.spectral
+        models, spectral = curriculum.models, curriculum.spectral
         discriminator, _ = spectral_normalize(models.discriminator, spectral, bound=hparams.spectral_bound)
         return Judgement(
             logit=objectives.score(discriminator, rollouts),
@@ -127,7 +133,7 @@ def judge(trainer: Trainer, states: TrainState, hparams: HParams, w: Params, key
             success=outcome.success,
         )
 
-    return jax.jit(jax.vmap(of_lane, in_axes=(0, 0, None)))(states, hparams, w)
+    return jax.jit(jax.vmap(of_lane, in_axes=(0, 0, 0, None)))(policies, curricula, hparams, w)
 
 
 def table(ladder: Ladder, judged: Judgement) -> str:

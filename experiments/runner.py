@@ -136,14 +136,16 @@ def lane_inputs(experiment: Experiment) -> tuple[Key[Array, "L"], HParams]:
 
 
 def load_lanes(directory: Path, experiment: Experiment, trainer: Trainer) -> tuple[TrainState, Clock, HParams]:
-    """States and hyper-parameters (leaves [L, ...]) of a run directory's latest checkpoint, and its clock, on the first device.
+    """States and hyper-parameters (leaves [L, ...]) of a run directory's latest checkpoint, and its clock.
+
+    They are in the host's memory, because a run may have more lanes than fit a device: what is used has to be put there.
 
     Raises:
       UsageError: there is none, or it cannot be read.
     """
     keys, hparams = lane_inputs(experiment)
-    here = Mesh(np.array(jax.devices()[:1]), ("lane",))
-    states, clock = load_states(RunDir(directory).checkpoints, trainer, keys, hparams, here)
+    host = Mesh(np.array([runtime.host()]), ("lane",))
+    states, clock = load_states(RunDir(directory).checkpoints, trainer, keys, hparams, host)
     return jax.tree.map(lambda x: x[: len(experiment.lanes)], states), clock, hparams
 
 

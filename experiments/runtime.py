@@ -29,6 +29,14 @@ def setup(cpu_devices: int | None = None) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _MIN_COMPILE_SECONDS)
 
 
+def host() -> jax.Device:
+    """The CPU as a device; where `JAX_PLATFORMS` leaves it out, the first device."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return jax.local_devices()[0]
+
+
 def device_memory() -> int | None:
     """Bytes that this process may use of a device's memory; None where the host's is used, as on CPU."""
     return (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit")

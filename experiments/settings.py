@@ -173,8 +173,8 @@ def check(experiment: Experiment, session: Session) -> None:
     """Raises a `UsageError` for what can be told wrong without the task space."""
     if not experiment.seeds or len(set(experiment.seeds)) != len(experiment.seeds):
         raise UsageError(f"--seeds needs one or more different numbers, got {' '.join(map(str, experiment.seeds)) or 'none'}")
-    if min(experiment.seeds) < 0:
-        raise UsageError(f"--seeds must not be negative, got {min(experiment.seeds)}")
+    if not 0 <= min(experiment.seeds) <= max(experiment.seeds) < 2**31:
+        raise UsageError(f"--seeds must lie in [0, 2^31), got {' '.join(map(str, experiment.seeds))}")
     if experiment.target_file and not experiment.target_file.is_file():
         raise UsageError(f"--target-file {experiment.target_file} is no file")
     for name, values in lanes.swept(experiment.hparams).items():

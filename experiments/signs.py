@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tyro
 from jaxtyping import Float, Int
 
-from experiments import run_dir
+from apt_jax.config import HParams
+from experiments import run_dir, settings
 from experiments.errors import UsageError, exit_with
 
 HEADER = (
@@ -58,42 +58,42 @@ def main() -> int:
 
 
 def table(runs: Sequence[Path], *, after: int = Signs.after) -> str:
-    """A Markdown table with a line per seed.
+    """A Markdown table with a line per seed and setting.
 
     Raises:
       UsageError: no evaluation yet, a run without a generator, or one that ended before `after`.
     """
     rows = []
     for path in runs:
-        config = run_dir.read_config(path)
+        experiment = settings.load(path)
         env_steps, curves = run_dir.read_metrics(path)
         if "beta" not in curves:
-            raise UsageError(f"{path} has no generator: its method is {config['config']['method']}")
+            raise UsageError(f"{path} has no generator: its method is {experiment.config.method}")
         if env_steps[-1] <= after:
             raise UsageError(f"--after must be below the {env_steps[-1]:,} steps of {path}, got {after:,}")
-        for lane, seed in enumerate(config["seeds"]):
-            seed_curves = {name: values[lane] for name, values in curves.items()}
-            rows.append(row(path.name, seed, env_steps, seed_curves, after, config["hparams"]))
+        for i, lane in enumerate(experiment.lanes):
+            own = {name: values[i] for name, values in curves.items()}
+            rows.append(row(path.name, lane.name.removeprefix("seed "), env_steps, own, after, lane.hparams))
     return "\n".join((f"| {' | '.join(HEADER)} |", "|---" * len(HEADER) + "|", *rows))
 
 
 def row(
     name: str,
-    seed: int,
+    lane: str,
     env_steps: Int[np.ndarray, "T"],
     curves: dict[str, Float[np.ndarray, "T"]],
     after: int,
-    hparams: dict[str, Any],
+    hparams: HParams,
 ) -> str:
     """One line of the table; a metric that the task space lacks is a dash."""
     late = env_steps > after
     returns = curves["generated_episode_return"][late]
     low, high = np.nanpercentile(returns, [10, 90])
     beta = curves["beta"][late]
-    bounds = [np.mean(beta == float(hparams[bound])) for bound in ("beta_min", "beta_max")]
+    bounds = [np.mean(beta == getattr(hparams, bound)) for bound in ("beta_min", "beta_max")]
     cells = (
         name,
-        str(seed),
+        lane,
         f"{np.nanmean(returns):.2f} ({low:.2f} to {high:.2f})",
         ", ".join(f"{share:.0%}" for share in bounds),
         over_time(env_steps, curves.get("probe_solution_length"), 1),

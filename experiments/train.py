@@ -74,8 +74,8 @@ def train(experiment: Experiment, session: Session) -> int:
         view.stop()
         policies = runner.policies()
         if processes.is_first() and run_dir.wall_seconds(run.path):
-            run.write_json("summary.json", summarise(run.path, experiment, times))
             pictures.draw(run.path, experiment, problem, policies)
+            run.write_json("summary.json", summarise(run.path, experiment, times))  # last: it says that the run is complete
         if runner.env_steps < experiment.env_steps:
             view.note(f"stopped at {runner.env_steps:,} steps; to go on: {session.resume_command}")
             return EXIT_CODE

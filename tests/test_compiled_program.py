@@ -150,6 +150,15 @@ def test_there_is_no_room_for_a_copy_of_a_ring(chunk, states):
     assert chunk.memory_analysis().temp_size_in_bytes < min(ring.size * ring.dtype.itemsize // 2 for ring in rings)
 
 
+def test_lanes_side_by_side_copy_no_ring(states):
+    """Two on one device, as accelerators have them."""
+    together = program(layout="vmap", devices=jax.devices()[:1])
+    chunk = together.chunk.lower(states, jax.eval_shape(Clock.start), lanes()[1]).compile()
+    assert copies(chunk.as_text(), COLUMNS) == []
+    ring = min(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(states.replay.transitions))
+    assert chunk.memory_analysis().temp_size_in_bytes < ring
+
+
 def test_lanes_that_take_turns_have_room_for_one_besides():
     """Three on one device: the one at work is taken out and put back."""
     turns = program(3, layout="map", devices=jax.devices()[:1])

@@ -243,7 +243,9 @@ def test_without_a_good_task_goal_gan_learns_nothing_and_stays_uniform():
     ("curriculum", "changes", "words"),
     [
         ("alp_gmm", {"alp_fit_every": 150}, "alp_fit_every must be a positive multiple of refresh_every=100, got 150"),
-        ("alp_gmm", {"alp_window": 601}, "alp_window must be at most replay_episodes=600, got 601"),
+        ("alp_gmm", {"alp_window": 301}, "sum to at most replay_episodes=600, got 301 and 300"),
+        ("alp_gmm", {"alp_covariance": "diag"}, "alp_covariance must be one of full, diagonal, got 'diag'"),
+        ("goal_gan", {"goal_memory": 49}, "goal_tasks=50, got 49"),
         ("goal_gan", {"goal_tasks": 301}, "replay_episodes=600, got 602"),
     ],
 )

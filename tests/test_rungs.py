@@ -55,7 +55,10 @@ def test_models_of_every_lane_judge_every_task():
     keys = jax.eval_shape(lambda: jax.vmap(jax.random.key)(jnp.arange(2)))
     states = jax.eval_shape(jax.vmap(trainer.init), keys, hparams)
     w = rungs.choose(LADDER, 3, seed=1)
-    judged = jax.eval_shape(lambda states: rungs.judge(trainer, states, hparams, w, jax.random.key(0)), states)
+    policies = states.learner.target_params
+    judged = jax.eval_shape(
+        lambda *judges: rungs.judge(trainer, *judges, hparams, w, jax.random.key(0)), policies, states.curriculum
+    )
     assert {x.shape for x in judged} == {(2, 3 * len(LADDER.steps))}
 
 

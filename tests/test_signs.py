@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 
+from apt_jax.config import HParams
 from experiments import report, signs
 from experiments.errors import UsageError, check_folder
 
@@ -30,8 +31,13 @@ def test_a_row_averages_what_lies_after_the_given_step():
         "v2_bias": np.where(late, 0.1, 9.0),
         "generator_return": np.where(late, 0.25, 9.0),
     }
-    row = signs.row("run", 3, env_steps, curves, 4_000, {"beta_min": 0.125, "beta_max": 8.0})
+    row = signs.row("run", "3", env_steps, curves, 4_000, HParams(beta_min=0.125, beta_max=8.0))
     assert row == "| run | 3 | 0.50 (0.50 to 0.50) | 50%, 25% | - | - | - | - | 0.25 | -0.50 | +0.10 | -0.25 (0.25; nan) |"
+
+
+def test_runs_of_one_name_are_not_mixed_up(tmp_path):
+    with pytest.raises(UsageError, match="must differ: apt_gen"):
+        report.read([tmp_path / "A" / "apt_gen", tmp_path / "B" / "apt_gen"])
 
 
 def test_error_has_a_mean_a_size_and_a_correlation_and_skips_gaps():

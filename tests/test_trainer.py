@@ -325,6 +325,8 @@ def test_resuming_from_a_checkpoint_equals_never_having_stopped(tmp_path, stop):
         ({"eval_every": 44}, "eval_every must be a multiple of refresh_every=20, got 44"),
         ({"eval_every": 50}, "eval_every .* 4 environment steps"),
         ({"recent_steps": 20}, "recent_steps .* at least 24, got 20"),
+        ({"model_batch_size": 1}, "model_batch_size must be at least 2 .* got 1"),
+        ({"model_batch_size": 3}, "multiple of the 2 sources, got 3"),
         ({"replay_episodes": 5}, "replay_episodes .* return_window=10"),
         ({"refresh_every": 18}, "refresh_every .* 4 environment steps"),
         ({"warmup_steps": 40}, "warmup_steps .* at least 48, got 40"),

@@ -9,14 +9,14 @@ be told from 250 episodes.  The weakness is the method's own.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import replay as rp
-from apt_jax.config import Config, HParams
+from apt_jax.config import Config, Covariance, HParams
 from apt_jax.curricula.base import GENERATED, Curriculum, Metrics, no_update
 from apt_jax.curricula.mixture import Mixture, draw, fit, k_means
 from apt_jax.specs import Params, block_weights, flatten, unflatten
@@ -42,10 +42,16 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
     """Mixtures over the flattened task parameter, every block scaled to weigh the same.
 
     Raises:
-      ValueError: a window that the replay does not hold, or that is due between two refreshes.
+      ValueError: a window with its history that the replay does not hold, a fit that is due between two refreshes, or an
+        unknown covariance.
     """
-    if config.replay_episodes < config.alp_window:
-        raise ValueError(f"alp_window must be at most replay_episodes={config.replay_episodes}, got {config.alp_window}")
+    if config.replay_episodes < config.alp_window + config.alp_history:
+        raise ValueError(
+            f"alp_window and alp_history must sum to at most replay_episodes={config.replay_episodes}, "
+            f"got {config.alp_window} and {config.alp_history}"
+        )
+    if config.alp_covariance not in get_args(Covariance):
+        raise ValueError(f"alp_covariance must be one of {', '.join(get_args(Covariance))}, got {config.alp_covariance!r}")
     if config.alp_fit_every < 1 or config.alp_fit_every % config.refresh_every:
         raise ValueError(
             f"alp_fit_every must be a positive multiple of refresh_every={config.refresh_every}, got {config.alp_fit_every}"
@@ -98,9 +104,9 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
         return jax.tree.map(lambda a, b: jnp.where(usable, a, b), new, state)
 
     def refresh(
-        state: AlpGmmState, key: Key[Array, ""], replay: rp.Replay, iteration: Int[Array, ""], hparams: HParams
+        state: AlpGmmState, key: Key[Array, ""], replay: rp.Replay, iterations: Int[Array, ""], hparams: HParams
     ) -> AlpGmmState:
-        trained = iteration * steps - config.warmup_steps
+        trained = iterations * steps - config.warmup_steps
         return jax.lax.cond(
             trained % config.alp_fit_every == config.refresh_every % config.alp_fit_every,
             lambda: refit(state, key, replay, hparams),

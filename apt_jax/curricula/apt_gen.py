@@ -153,9 +153,9 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
         return AptGenState(models, opt_state, batch_stats, spectral, state.beta), metrics
 
     def refresh(
-        state: AptGenState, key: Key[Array, ""], replay: rp.Replay, iteration: Int[Array, ""], hparams: HParams
+        state: AptGenState, key: Key[Array, ""], replay: rp.Replay, iterations: Int[Array, ""], hparams: HParams
     ) -> AptGenState:
-        del key, iteration
+        del key, iterations
         outcome = rp.recent_outcome(replay, source=GENERATED, window=config.return_window, since=warm)
         beta = adapt_beta(
             state.beta,

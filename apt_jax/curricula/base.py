@@ -29,7 +29,10 @@ class ProposeFn(Protocol):
 
 
 class UpdateFn(Protocol):
-    """`update(state, key, replay, iteration, hparams) -> (state, metrics)`: one round of learning; consumes `key`."""
+    """`update(state, key, replay, iteration, hparams) -> (state, metrics)`: one round of learning; consumes `key`.
+
+    `iteration` is the latest one written to the replay.
+    """
 
     def __call__(
         self, state: Any, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
@@ -37,12 +40,15 @@ class UpdateFn(Protocol):
 
 
 class RefreshFn(Protocol):
-    """`refresh(state, key, replay, iteration, hparams) -> state`: slow adaptation on the cadence `Config.refresh_every`.
+    """`refresh(state, key, replay, iterations, hparams) -> state`: slow adaptation on the cadence `Config.refresh_every`.
 
-    Consumes `key`.  `iteration` is never batched: work that is due less often goes behind a `cond` on it, and on nothing else.
+    Consumes `key`.  `iterations` is how many there have been, one more than the latest one written to the replay.  It is never
+    batched: work that is due less often goes behind a `cond` on it, and on nothing else.
     """
 
-    def __call__(self, state: Any, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams) -> Any: ...
+    def __call__(
+        self, state: Any, key: Key[Array, ""], replay: Replay, iterations: Int[Array, ""], hparams: HParams
+    ) -> Any: ...
 
 
 class ReportFn(Protocol):
@@ -75,9 +81,9 @@ def no_update(
     return state, {}
 
 
-def no_refresh(state: Any, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams) -> Any:
+def no_refresh(state: Any, key: Key[Array, ""], replay: Replay, iterations: Int[Array, ""], hparams: HParams) -> Any:
     """The `refresh` of a curriculum that does not adapt."""
-    del key, replay, iteration, hparams
+    del key, replay, iterations, hparams
     return state
 
 

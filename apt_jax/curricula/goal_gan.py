@@ -87,6 +87,8 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
     episodes = config.goal_tasks * config.goal_rollouts
     if config.replay_episodes < episodes:
         raise ValueError(f"goal_tasks * goal_rollouts must be at most replay_episodes={config.replay_episodes}, got {episodes}")
+    if config.goal_memory < config.goal_tasks:
+        raise ValueError(f"goal_memory must hold the good ones of goal_tasks={config.goal_tasks}, got {config.goal_memory}")
     size = block_weights(space.param_spec).size
     generator, critic = TaskGenerator(size), TaskCritic()
 
@@ -146,9 +148,9 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
         return state._replace(networks=networks, opt_state=opt_state), metrics
 
     def refresh(
-        state: GoalGanState, key: Key[Array, ""], replay: rp.Replay, iteration: Int[Array, ""], hparams: HParams
+        state: GoalGanState, key: Key[Array, ""], replay: rp.Replay, iterations: Int[Array, ""], hparams: HParams
     ) -> GoalGanState:
-        del key, iteration
+        del key, iterations
         recent, earlier = rp.latest_episodes(replay, source=GENERATED, count=episodes)
         tasks = 2.0 * flatten(space.param_spec, recent.w) - 1.0
         rate, judged = success_rates(tasks, recent.success, earlier >= 0, rollouts=config.goal_rollouts)
