@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import optax
@@ -17,3 +17,9 @@ ADAM = optax.flatten(optax.scale_by_adam())
 def descend(params: Params, direction: Params, rate: Float[Array, ""] | float) -> Params:
     """Parameters after a step of size `rate` against `direction`, a pytree like `params`."""
     return jax.tree.map(lambda p, d: p - rate * d, params, direction)
+
+
+def adam_step(params: Params, opt_state: Any, grads: Params, rate: Float[Array, ""] | float) -> tuple[Params, Any]:
+    """Parameters and Adam's state after a step of size `rate` against `grads`, a pytree like `params`."""
+    direction, opt_state = ADAM.update(grads, opt_state)
+    return descend(params, direction, rate), opt_state

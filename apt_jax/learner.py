@@ -10,7 +10,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from apt_jax.config import HParams
-from apt_jax.descent import ADAM, descend
+from apt_jax.descent import ADAM, adam_step
 from apt_jax.losses import td_errors, td_target
 from apt_jax.networks import QNetwork
 from apt_jax.networks.apply import apply
@@ -100,8 +100,7 @@ def update(
         return jnp.mean(optax.losses.huber_loss(td_errors(q, batch.action, target))), q
 
     (value, q), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
-    direction, opt_state = ADAM.update(grads, state.opt_state)
-    params = descend(state.params, direction, hparams.learning_rate)
+    params, opt_state = adam_step(state.params, state.opt_state, grads, hparams.learning_rate)
     target_params = optax.incremental_update(params, state.target_params, hparams.target_rate)
     return LearnerState(params, target_params, opt_state), {"td_loss": value, "q_mean": jnp.mean(jnp.max(q, axis=-1))}
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from apt_jax.bonuses.base import Bonus, Metrics, Step, Steps, Stream, leading, pay, sample
 from apt_jax.config import Config, HParams
-from apt_jax.descent import ADAM, descend
+from apt_jax.descent import ADAM, adam_step
 from apt_jax.networks import Dynamics
 from apt_jax.networks.apply import apply
 from apt_jax.replay import Batch, Replay
@@ -65,8 +65,7 @@ def make(space: TaskSpace, config: Config) -> Bonus:
             }
 
         grads, metrics = jax.grad(loss, has_aux=True)(state.params)
-        direction, opt_state = ADAM.update(grads, state.opt_state)
-        params = descend(state.params, direction, hparams.bonus_learning_rate)
+        params, opt_state = adam_step(state.params, state.opt_state, grads, hparams.bonus_learning_rate)
         return IcmState(params, opt_state, state.stream), metrics
 
     def return_range(state: IcmState, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, Key
 from apt_jax.bonuses.base import Bonus, Metrics, Step, Steps, Stream, leading, pay, sample
 from apt_jax.bonuses.moments import Moments
 from apt_jax.config import Config, HParams
-from apt_jax.descent import ADAM, descend
+from apt_jax.descent import ADAM, adam_step
 from apt_jax.networks import Distillation
 from apt_jax.networks.apply import apply
 from apt_jax.networks.encoders import Features, observation_features
@@ -93,8 +93,7 @@ def make(space: TaskSpace, config: Config) -> Bonus:
     ) -> tuple[RndState, Metrics]:
         _, _, next_obs = sample(space, config, replay, key, iteration)
         loss, grads = jax.value_and_grad(lambda params: jnp.mean(error(state, params, next_obs)))(state.predictor)
-        direction, opt_state = ADAM.update(grads, state.opt_state)
-        predictor = descend(state.predictor, direction, hparams.bonus_learning_rate)
+        predictor, opt_state = adam_step(state.predictor, state.opt_state, grads, hparams.bonus_learning_rate)
         return state._replace(predictor=predictor, opt_state=opt_state), {"rnd_loss": loss}
 
     def return_range(state: RndState, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:

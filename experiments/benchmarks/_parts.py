@@ -13,7 +13,7 @@ from apt_jax import learner, replay, workers
 from apt_jax.curricula import apt_gen
 from apt_jax.curricula.apt_gen_objectives import make_objectives
 from apt_jax.curricula.base import GENERATED, TARGET
-from apt_jax.descent import ADAM, descend
+from apt_jax.descent import ADAM, adam_step
 from apt_jax.methods import make_method
 from apt_jax.networks import QNetwork
 from apt_jax.specs import zeros_like
@@ -153,8 +153,7 @@ def model_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, 
 
     def optimise(loss: Callable[[Any], tuple[Float[Array, ""], Any]], params: Any, opt_state: Any) -> Any:
         grads, aux = jax.grad(loss, has_aux=True)(params)
-        direction, opt_state = ADAM.update(grads, opt_state)
-        return descend(params, direction, hparams.learning_rate), opt_state, aux
+        return *adam_step(params, opt_state, grads, hparams.learning_rate), aux
 
     def update_discriminator(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         del key

@@ -25,7 +25,7 @@ from jaxtyping import Array, Int, Key
 
 from apt_jax import learner, replay
 from apt_jax.config import HParams
-from apt_jax.descent import ADAM, descend
+from apt_jax.descent import adam_step
 from apt_jax.learner import LearnerState
 from apt_jax.losses import td_errors, td_target
 from apt_jax.networks import QNetwork
@@ -144,8 +144,7 @@ def _from_values(
     def loss(params: Any) -> Array:
         return jnp.mean(optax.losses.huber_loss(td_errors(q(params), batch.action, target)))
 
-    direction, opt_state = ADAM.update(jax.grad(loss)(state.params), state.opt_state)
-    params = descend(state.params, direction, material.hparams.learning_rate)
+    params, opt_state = adam_step(state.params, state.opt_state, jax.grad(loss)(state.params), material.hparams.learning_rate)
     target_params = optax.incremental_update(params, state.target_params, material.hparams.target_rate)
     return LearnerState(params, target_params, opt_state)
 
@@ -184,8 +183,9 @@ def observations_in_one_forward(material: Material) -> Run:
             )
             return jnp.mean(optax.losses.huber_loss(td_errors(q, batch.action, target)))
 
-        direction, opt_state = ADAM.update(jax.grad(loss)(state.params), state.opt_state)
-        params = descend(state.params, direction, material.hparams.learning_rate)
+        params, opt_state = adam_step(
+            state.params, state.opt_state, jax.grad(loss)(state.params), material.hparams.learning_rate
+        )
         return LearnerState(
             params, optax.incremental_update(params, state.target_params, material.hparams.target_rate), opt_state
         )
