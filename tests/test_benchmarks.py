@@ -305,3 +305,29 @@ def test_every_benchmark_is_in_the_list_of_all():
     for script, *options in everything.RUNS.values():
         module = importlib.import_module(f"experiments.benchmarks.{script}")
         tyro.cli(module.Args, args=options)
+
+
+@pytest.mark.parametrize(
+    ("saved", "quick", "kept"),
+    [
+        ({}, False, True),
+        ({}, True, False),
+        ({"cpu": "another"}, False, False),
+        ({"packages": {"jax": "1.0"}}, False, False),
+        ({"peers": {"torch": None}}, False, False),
+        ({"git_commit": "abc-dirty"}, False, False),
+    ],
+)
+def test_only_what_was_measured_under_the_same_conditions_is_kept(tmp_path, saved, quick, kept):
+    here = {"git_commit": "abc", "cpu": "one", "cores": 2, "packages": {"jax": "0.10.2"}, "peers": {"torch": "2.13"}}
+    out = tmp_path / "seeds.json"
+    assert not everything.is_measured(out, here, quick)
+    out.write_text(json.dumps({"settings": {"quick": False}, "environment": here | saved | {"busy": 0.0}}))
+    assert everything.is_measured(out, here, quick) == kept
+    assert not everything.is_measured(out, here | {"git_commit": None}, quick)
+    assert not everything.is_measured(out, {**here, **saved, "git_commit": "abc-dirty"}, quick)
+
+
+def test_the_share_of_a_busy_machine_is_a_share():
+    share = _measure.busy_share(0.01)
+    assert math.isnan(share) or 0 <= share <= 1

@@ -288,10 +288,15 @@ def begin(name: str, rings: Replay, args: Args) -> Begun:
     # No compilation cache: the seconds to compile are results too.
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_num_cpu_devices", 1)
-    material = make_material(load_problem(args), rings, widen=variant.widen)
-    run = variant.make(material)
+    problem = load_problem(args)
 
-    def loop(carry: tuple[LearnerState, Key[Array, ""]], rings: Replay, length: Int[Array, ""]) -> Any:
+    # Nothing is a constant that training does not know either, or the compiler could compute with it.
+    def loop(
+        carry: tuple[LearnerState, Key[Array, ""]], fixed: tuple[Replay, HParams], length: Int[Array, ""]
+    ) -> tuple[LearnerState, Key[Array, ""]]:
+        rings, hparams = fixed
+        run = variant.make(make_material(problem._replace(hparams=hparams), rings, widen=variant.widen))
+
         def iteration(_: Any, carry: tuple[LearnerState, Key[Array, ""]]) -> tuple[LearnerState, Key[Array, ""]]:
             state, key = carry
             key, key_run = jax.random.split(key)
@@ -299,13 +304,14 @@ def begin(name: str, rings: Replay, args: Args) -> Begun:
 
         return jax.lax.fori_loop(0, length, iteration, carry)
 
-    carry = jax.jit(partial(learner.init, material.network))(jax.random.key(0)), jax.random.key(1)
-    rings = jax.device_put(rings)
-    compiled, compile_seconds = _measure.compile_ahead(jax.jit(loop, donate_argnums=0), carry, rings, np.int32(1))
+    network = make_material(problem, rings, widen=variant.widen).network
+    carry = jax.jit(partial(learner.init, network))(jax.random.key(0)), jax.random.key(1)
+    fixed = jax.device_put((rings, jax.tree.map(np.float32, problem.hparams)))
+    compiled, compile_seconds = _measure.compile_ahead(jax.jit(loop, donate_argnums=0), carry, fixed, np.int32(1))
 
     def iterations() -> None:
         nonlocal carry
-        carry = jax.block_until_ready(compiled(carry, rings, np.int32(args.iterations)))
+        carry = jax.block_until_ready(compiled(carry, fixed, np.int32(args.iterations)))
 
     iterations()  # nothing is warm for the first
     return iterations, compile_seconds
