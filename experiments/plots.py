@@ -58,30 +58,35 @@ def learning_curves(file: Path, settings: Mapping[str, Run], *, delta: float | N
     figure.savefig(file, dpi=150)
 
 
-def comparison(file: Path, panels: Mapping[str, Mapping[str, Run]]) -> None:
-    """The target return of several runs, by panel and name: every seed thin, their mean thick, a standard deviation shaded.
+def comparison(file: Path, panels: Mapping[str, Mapping[str, Run]], *, metrics: Sequence[str] = ("target_return",)) -> None:
+    """Metrics of several runs, by panel and name: every seed thin, their mean thick, a standard deviation shaded.
 
-    A name has the same colour in every panel.
+    A name has the same colour in every panel; a run that lacks a metric is left out there.
     """
     names = list(dict.fromkeys(name for runs in panels.values() for name in runs))
-    figure = Figure(figsize=(7 if len(panels) == 1 else 5 * len(panels), 4), layout="constrained")
-    for axes, (title, runs) in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels.items(), strict=True):
+    count = len(panels) * len(metrics)
+    figure = Figure(figsize=(7 if count == 1 else 5 * count, 4), layout="constrained")
+    columns = [(title, runs, metric) for title, runs in panels.items() for metric in metrics]
+    for axes, (title, runs, metric) in zip(np.atleast_1d(figure.subplots(1, count)), columns, strict=True):
         for name, (env_steps, curves) in runs.items():
-            colour = f"C{names.index(name)}"
-            mean, deviation = curves["target_return"].mean(axis=0), curves["target_return"].std(axis=0)
+            if metric not in curves:
+                continue
+            colour, values = f"C{names.index(name)}", np.ma.masked_invalid(curves[metric])
+            mean, deviation = values.mean(axis=0), values.std(axis=0)
             axes.fill_between(env_steps, mean - deviation, mean + deviation, color=colour, alpha=0.1, linewidth=0)
-            for values in curves["target_return"]:
-                axes.plot(env_steps, values, color=colour, linewidth=0.8, alpha=0.4)
+            for own in values:
+                axes.plot(env_steps, own, color=colour, linewidth=0.8, alpha=0.4)
             axes.plot(env_steps, mean, color=colour, linewidth=2.5, label=name)
-        _decorate(axes, "target_return")
+        _decorate(axes, metric)
         if title:
             axes.set_title(title, fontsize="medium")
-        axes.legend(fontsize="small")
+        if axes.lines:
+            axes.legend(fontsize="small")
     figure.savefig(file, dpi=150)
 
 
 def _decorate(axes: Axes, name: str) -> None:
-    axes.set_title(PANELS[name], fontsize="medium")
+    axes.set_title(PANELS.get(name, name), fontsize="medium")
     axes.set_xlabel("environment steps")
     axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k")
     axes.grid(alpha=0.3)

@@ -33,11 +33,13 @@ class Report:
 
     Attributes:
       runs: run directories; a run is called by its directory's name, and each combination of swept hyper-parameters is one.
-      figure: where to draw the target return of every seed; not drawn by default.
+      figure: where to draw the metrics of every seed; not drawn by default.
+      metrics: columns of metrics.csv that the figure shows, a panel each.
     """
 
     runs: tuple[Path, ...]
     figure: Path | None = None
+    metrics: tuple[str, ...] = ("target_return",)
 
 
 def main() -> int:
@@ -46,10 +48,13 @@ def main() -> int:
     if not report.runs:
         raise UsageError("--runs needs at least one directory")
     runs = read(report.runs)
+    known = {metric for _, curves in runs.values() for metric in curves}
+    if not report.metrics or not known.issuperset(report.metrics):
+        raise UsageError(f"--metrics must be among {', '.join(sorted(known))}; got {', '.join(report.metrics) or 'none'}")
     print(table(runs))
     if report.figure:
         report.figure.parent.mkdir(parents=True, exist_ok=True)
-        plots.comparison(report.figure, {"": runs})
+        plots.comparison(report.figure, {"": runs}, metrics=report.metrics)
     return 0
 
 

@@ -37,6 +37,8 @@ def test_comparisons_have_a_panel_per_target_and_curves_a_colour_per_setting(tmp
     )
     plots.comparison(tmp_path / "two.png", {"A": {"dqn": run, "rnd": run}, "B": {"rnd": run}})
     plots.comparison(tmp_path / "three.png", {name: {"dqn": run} for name in "ABC"})
+    plots.comparison(tmp_path / "metrics.png", {"": {"dqn": run}}, metrics=("target_return", "beta", "seed"))
+    assert read(tmp_path / "metrics.png").shape == read(tmp_path / "three.png").shape
     assert 2 * read(tmp_path / "three.png").shape[1] == 3 * read(tmp_path / "two.png").shape[1]
     plots.learning_curves(tmp_path / "sweep.png", {"delta 0.1": run, "delta 0.3": run}, delta=None, title="sweep")
     assert read(tmp_path / "sweep.png").std() > 0
