@@ -3,7 +3,8 @@
 A table stands between two comments, of which the first says what it is made of, all of it in `experiments/results`:
 
     <!-- table: benchmark NAME [NAME ...] -->             what the scripts printed that wrote benchmarks/NAME.json
-    <!-- table: report FIGURE.png RUN [RUN ...] -->       `experiments.report` of runs; FIGURE.png is drawn
+    <!-- table: report FIGURE.png RUN [RUN ...] -->       `experiments.report` of runs; FIGURE.png shows their target return,
+                                                          or with METRIC=NAME among the words that metric
     <!-- table: signs RUN [RUN ...] -->                   `experiments.signs` of runs
     <!-- end of table -->
 """
@@ -81,8 +82,8 @@ def draw(text: str, results: Path) -> None:
     """The figure of every marked report."""
     for match in _TABLE.finditer(text):
         if match["kind"] == "report":
-            figure, *runs = match["names"].split()
-            plots.comparison(results / figure, {"": report.read([results / run for run in runs])})
+            figure, runs, metrics = _parse_report(match["names"].split(), results)
+            plots.comparison(figure, {"": report.read(runs)}, metrics=metrics or report.Report.metrics)
 
 
 def _benchmark(names: Sequence[str], results: Path) -> str:
@@ -98,8 +99,15 @@ def _benchmark(names: Sequence[str], results: Path) -> str:
 
 
 def _report(names: Sequence[str], results: Path) -> str:
-    _, *runs = names
-    return report.table(report.read([results / run for run in runs]))
+    _, runs, _ = _parse_report(names, results)
+    return report.table(report.read(runs))
+
+
+def _parse_report(names: Sequence[str], results: Path) -> tuple[Path, list[Path], list[str]]:
+    """The figure, the runs, and the metrics."""
+    figure, *words = names
+    metrics = [word.removeprefix("METRIC=") for word in words if word.startswith("METRIC=")]
+    return results / figure, [results / word for word in words if not word.startswith("METRIC=")], metrics
 
 
 def _signs(names: Sequence[str], results: Path) -> str:
