@@ -225,7 +225,6 @@ PRESETS: dict[str, tuple[Config, HParams]] = {
             target_rate=0.02,
             generator_learning_rate=7e-4,
             value_weight_decay=10.0,
-            recency=3.0,
             cell_noise=0.03,
             vector_noise=0.05,
             vector_prior=0.03,
