@@ -26,6 +26,12 @@ PANELS = {
 }
 """The metrics drawn, as far as a method and a task space have them."""
 
+_TITLES = PANELS | {
+    "generator_return": "What the generator expects them to return",
+    "v1_correlation": "V1's correlation with progress",
+    "v2_correlation": "V2's correlation with return",
+}
+
 _MEAN_COLOUR = "black"
 _TARGET_COLOUR = "tab:green"
 
@@ -73,7 +79,8 @@ def comparison(file: Path, panels: Mapping[str, Mapping[str, Run]], *, metrics: 
                 continue
             colour, values = f"C{names.index(name)}", np.ma.masked_invalid(curves[metric])
             mean, deviation = values.mean(axis=0), values.std(axis=0)
-            axes.fill_between(env_steps, mean - deviation, mean + deviation, color=colour, alpha=0.1, linewidth=0)
+            if metric != "beta":  # which is drawn on a logarithmic scale
+                axes.fill_between(env_steps, mean - deviation, mean + deviation, color=colour, alpha=0.1, linewidth=0)
             for own in values:
                 axes.plot(env_steps, own, color=colour, linewidth=0.8, alpha=0.4)
             axes.plot(env_steps, mean, color=colour, linewidth=2.5, label=name)
@@ -86,7 +93,7 @@ def comparison(file: Path, panels: Mapping[str, Mapping[str, Run]], *, metrics: 
 
 
 def _decorate(axes: Axes, name: str) -> None:
-    axes.set_title(PANELS.get(name, name), fontsize="medium")
+    axes.set_title(_TITLES.get(name, name), fontsize="medium")
     axes.set_xlabel("environment steps")
     axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k")
     axes.grid(alpha=0.3)
