@@ -56,6 +56,24 @@ def time_part(part: Part, clock: Clock, *, repeats: int, at_least: float) -> Tim
     return time_loop(step, carry, part.fixed, repeats=repeats, at_least=at_least)
 
 
+def sample_batches(
+    problem: Problem, rings: replay.Replay, key: Key[Array, ""], iteration: Int[Array, ""], batches: int
+) -> replay.Batch:
+    """Batches for so many policy updates, leaves [batches, B, ...], as the trainer draws them; consumes `key`."""
+    space, _, config, hparams = problem
+    return replay.sample_transitions(
+        rings,
+        key,
+        iteration,
+        batches=batches,
+        batch_size=config.batch_size,
+        n_step=config.n_step,
+        success_share=config.success_share,
+        horizon=space.horizon,
+        gamma=hparams.gamma,
+    )
+
+
 def iteration_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[str, Part]:
     """What every iteration does, in order, and what every `refresh_every` steps adds, from a state of training."""
     space, target, config, hparams = problem
@@ -82,18 +100,7 @@ def iteration_parts(problem: Problem, state: TrainState, clock: Clock) -> dict[s
         return replay.write(state, iteration, transition, episode, done), ()
 
     def sample(_: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
-        batches = replay.sample_transitions(
-            fixed,
-            key,
-            iteration,
-            batches=updates,
-            batch_size=config.batch_size,
-            n_step=config.n_step,
-            success_share=config.success_share,
-            horizon=space.horizon,
-            gamma=hparams.gamma,
-        )
-        return (), batches
+        return (), sample_batches(problem, fixed, key, iteration, updates)
 
     def update_policy(state: Any, fixed: Any, key: Key[Array, ""], iteration: Int[Array, ""]) -> Any:
         del key, iteration

@@ -23,7 +23,7 @@ import optax
 import tyro
 from jaxtyping import Array, Int, Key
 
-from apt_jax import learner, replay
+from apt_jax import learner
 from apt_jax.config import HParams
 from apt_jax.descent import adam_step
 from apt_jax.learner import LearnerState
@@ -37,7 +37,7 @@ from apt_jax.trainer import Clock, make_trainer
 from experiments.benchmarks import _measure
 from experiments.benchmarks._in_turns import Begun, Worker
 from experiments.benchmarks._measure import Options, Problem, Timing
-from experiments.benchmarks._parts import SOURCES
+from experiments.benchmarks._parts import SOURCES, sample_batches
 from experiments.errors import UsageError, exit_with
 
 LANES = 16
@@ -122,27 +122,25 @@ def sampled_one_by_one(material: Material) -> Run:
     return run
 
 
-def _from_values(
-    material: Material,
-    state: LearnerState,
-    batch: Batch,
-    next_values: Callable[[Any, Any], tuple[Array, Array]],
-    q: Callable[[Any], Array],
-) -> LearnerState:
-    """`learner.update` from the values of the next observation by both networks, and those of the observation by parameters."""
+Values = tuple[Array, Array, Array]
+"""Of a batch: of the observation, and of the next one by the online and by the target network, each [B, A]."""
+
+
+def _learn(material: Material, state: LearnerState, batch: Batch, values: Callable[[Any, Any], Values]) -> LearnerState:
+    """`learner.update` with `values(params, target_params)` in place of its three forward passes."""
     low, high = material.bounds
-    next_selector, next_value = next_values(state.params, state.target_params)
-    target = td_target(
-        reward=batch.reward,
-        discount=batch.discount,
-        next_q_selector=next_selector,
-        next_q_value=next_value,
-        low=low,
-        high=high,
-    )
 
     def loss(params: Any) -> Array:
-        return jnp.mean(optax.losses.huber_loss(td_errors(q(params), batch.action, target)))
+        q, next_selector, next_value = values(params, state.target_params)
+        target = td_target(
+            reward=batch.reward,
+            discount=batch.discount,
+            next_q_selector=next_selector,
+            next_q_value=next_value,
+            low=low,
+            high=high,
+        )
+        return jnp.mean(optax.losses.huber_loss(td_errors(q, batch.action, jax.lax.stop_gradient(target))))
 
     params, opt_state = adam_step(state.params, state.opt_state, jax.grad(loss)(state.params), material.hparams.learning_rate)
     target_params = optax.incremental_update(params, state.target_params, material.hparams.target_rate)
@@ -151,49 +149,36 @@ def _from_values(
 
 def networks_in_one_forward(material: Material) -> Run:
     """Online and target network as one batched forward pass over the next observation."""
+    network = material.network
 
     def update(state: LearnerState, batch: Batch) -> LearnerState:
-        def next_values(params: Any, target_params: Any) -> tuple[Array, Array]:
-            both = jax.tree.map(lambda *leaves: jnp.stack(leaves), params, target_params)
-            selector, value = jax.vmap(lambda one: apply(material.network, one, batch.next_obs))(both)
-            return selector, value
+        def values(params: Any, target_params: Any) -> Values:
+            both = jax.tree.map(lambda *leaves: jnp.stack(leaves), jax.lax.stop_gradient(params), target_params)
+            next_selector, next_value = jax.vmap(lambda one: apply(network, one, batch.next_obs))(both)
+            return apply(network, params, batch.obs), next_selector, next_value
 
-        return _from_values(material, state, batch, next_values, lambda params: apply(material.network, params, batch.obs))
+        return _learn(material, state, batch, values)
 
     return scan_updates(material, update)
 
 
 def observations_in_one_forward(material: Material) -> Run:
-    """The online network sees both observations of a transition in one forward pass; the next one's is not differentiated."""
+    """The online network sees both observations of a transition in one forward pass."""
+    network = material.network
 
     def update(state: LearnerState, batch: Batch) -> LearnerState:
-        both = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), batch.obs, batch.next_obs)
-        low, high = material.bounds
-        next_value = apply(material.network, state.target_params, batch.next_obs)
+        def values(params: Any, target_params: Any) -> Values:
+            both = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), batch.obs, batch.next_obs)
+            q, next_selector = jnp.split(apply(network, params, both), 2)
+            return q, next_selector, apply(network, target_params, batch.next_obs)
 
-        def loss(params: Any) -> Array:
-            q, next_selector = jnp.split(apply(material.network, params, both), 2)
-            target = td_target(
-                reward=batch.reward,
-                discount=batch.discount,
-                next_q_selector=jax.lax.stop_gradient(next_selector),
-                next_q_value=next_value,
-                low=low,
-                high=high,
-            )
-            return jnp.mean(optax.losses.huber_loss(td_errors(q, batch.action, target)))
-
-        params, opt_state = adam_step(
-            state.params, state.opt_state, jax.grad(loss)(state.params), material.hparams.learning_rate
-        )
-        return LearnerState(
-            params, optax.incremental_update(params, state.target_params, material.hparams.target_rate), opt_state
-        )
+        return _learn(material, state, batch, values)
 
     return scan_updates(material, update)
 
 
 def _q_of_features(material: Material) -> Callable[[Any, Any], Array]:
+    """`q(params, features)`: the Q-network without what makes features of an observation."""
     spec = material.network.obs_spec
 
     def q(variables: Any, features: Any) -> Array:
@@ -216,10 +201,10 @@ def features_at_once(material: Material) -> Run:
         def step(carry: LearnerState, inputs: tuple[Batch, Any, Any]) -> tuple[LearnerState, None]:
             batch, obs, next_obs = inputs
 
-            def next_values(params: Any, target_params: Any) -> tuple[Array, Array]:
-                return q(params, next_obs), q(target_params, next_obs)
+            def values(params: Any, target_params: Any) -> Values:
+                return q(params, obs), q(params, next_obs), q(target_params, next_obs)
 
-            return _from_values(material, carry, batch, next_values, lambda params: q(params, obs)), None
+            return _learn(material, carry, batch, values), None
 
         return jax.lax.scan(step, state, (batches, features(batches.obs), features(batches.next_obs)))[0]
 
@@ -338,17 +323,7 @@ def make_material(problem: Problem, rings: Replay, *, widen: bool = False) -> Ma
     latest = jnp.int32(config.warmup_steps // steps - 1)
 
     def sample(rings: Replay, key: Key[Array, ""], batches: int) -> Batch:
-        return replay.sample_transitions(
-            rings,
-            key,
-            latest,
-            batches=batches,
-            batch_size=config.batch_size,
-            n_step=config.n_step,
-            gamma=hparams.gamma,
-            success_share=config.success_share,
-            horizon=space.horizon,
-        )
+        return sample_batches(problem, rings, key, latest, batches)
 
     spec = {name: _wide(modality) for name, modality in space.obs_spec.items()} if widen else space.obs_spec
     network = QNetwork(spec, space.num_actions)
