@@ -220,10 +220,11 @@ def test_a_bonus_widens_the_clip_to_its_own_returns():
 
 
 def test_hyper_parameter_lanes_equal_separate_runs():
+    cfg = config("apt_gen", **SWITCHES)
     lanes = [HParams(delta=0.1, gamma=0.9), HParams(delta=0.9, gamma=0.5)]
-    several, _, _ = run(config("apt_gen"), [1, 1], hparams=lanes, layout="vmap")
+    several, _, _ = run(cfg, [1, 1], hparams=lanes, layout="vmap")
     for lane, hparams in enumerate(lanes):
-        alone, _, _ = run(config("apt_gen"), [1], hparams=[hparams])
+        alone, _, _ = run(cfg, [1], hparams=[hparams])
         assert_lane_equal(several, lane, alone)
     first, second = (leaves(jax.tree.map(lambda x, i=i: x[i], several.learner.params)) for i in (0, 1))
     assert any(not np.allclose(a, b) for a, b in zip(first, second, strict=True))

@@ -31,7 +31,7 @@ def table_xml(task: Task, cans: Float[np.ndarray, "3 2"], tool_pose: tuple[float
     return f"""
 <mujoco model="table">
   <compiler angle="radian"/>
-  <option timestep="{TIMESTEP}" gravity="0 0 {-GRAVITY}"/>
+  <option timestep="{TIMESTEP}" gravity="0 0 {-GRAVITY}" cone="elliptic"/>
   <default><geom solref="0.01 1" friction="{FRICTION} .005 .0001"/></default>
   <worldbody>
     {"".join(_ground(np.asarray(task.ground)))}
