@@ -21,7 +21,8 @@ TOOL_FRICTION = 0.2
 def table_xml(task: Task, cans: Float[np.ndarray, "3 2"], tool_pose: tuple[float, float, float] | None = None) -> str:
     """MJCF of a task with cans at some places, as free bodies `can0` to `can2`, those absent left out.
 
-    Obstacles are `obstacle*`, the surface is `ground*`.
+    Obstacles are `obstacle*`, the surface is `ground*`.  Friction cones are elliptic: with pyramids, which are MuJoCo's
+    default, sliding cans hop by a millimetre.
 
     Args:
       tool_pose: (x, y) of the tool's centre and the angle of its motion, in radians; without it there is no tool.
