@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import plots
+from experiments import plots, random_tasks
+from experiments.errors import UsageError
 
 
 def read(file: Path) -> np.ndarray:
@@ -65,3 +66,25 @@ def test_mosaic_has_a_column_per_step_and_a_row_per_task(tmp_path):
         sizes.append(read(tmp_path / "m.png").shape)
     assert sizes[1][1] - sizes[0][1] == pytest.approx(4 * 44, abs=8)
     assert sizes[0][0] == sizes[1][0] > 3 * 40
+
+
+def draw_random_tasks(monkeypatch, *options):
+    monkeypatch.setattr("sys.argv", ["random_tasks", *options])
+    monkeypatch.setattr("experiments.runtime.setup", lambda: None)
+    return random_tasks.main()
+
+
+def test_random_tasks_differ_by_seed_alone(tmp_path, monkeypatch):
+    files = [tmp_path / name for name in ("a.png", "b.png", "c.png")]
+    for file, seed in zip(files, (0, 0, 1), strict=True):
+        assert draw_random_tasks(monkeypatch, "--out", str(file), "--rows", "1", "--columns", "2", "--seed", str(seed)) == 0
+    first, again, other = map(read, files)
+    np.testing.assert_array_equal(first, again)
+    assert first.shape == other.shape
+    assert (first != other).any()
+
+
+@pytest.mark.parametrize("options", [("--rows", "0"), ("--columns", "-1"), ("--space", "chess")])
+def test_random_tasks_say_what_is_wrong(options, tmp_path, monkeypatch):
+    with pytest.raises(UsageError, match=r"at least 1|chess"):
+        draw_random_tasks(monkeypatch, "--out", str(tmp_path / "tasks.png"), *options)
