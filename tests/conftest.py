@@ -3,7 +3,8 @@
 * two CPU devices in each process, so that sharding is exercised for real;
 * a key used twice is an error (`jax_debug_key_reuse`);
 * mixing dtypes or ranks implicitly is an error (strict promotion);
-* programs are compiled without LLVM's optimisations: each runs a few times on small arrays, so compiling is what costs;
+* programs are compiled without LLVM's optimisations and by XLA's simpler emitters, which takes half the time: each runs a few
+  times on small arrays, so compiling is what costs;
 * compiled programs are dropped now and then: every one holds memory maps, and a process that has too many dies.
 
 The settings are global rather than per test, so that module-scoped fixtures compile under them too.  A test that has to
@@ -20,7 +21,8 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
+FAST_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FAST_COMPILE}"
 
 import hypothesis
 import jax
