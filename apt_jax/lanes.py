@@ -117,12 +117,14 @@ def make_program(
     warmup = over_lanes(trainer.warmup, (lane, shared, lane), (lane, shared))
     chunk = over_lanes(trainer.chunk, (lane, shared, lane), (lane, shared, lane))
 
-    # It runs once: code that is compiled in half the time is worth more than code that is faster.
-    @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+    # What runs once is better compiled sooner than made faster.  XLA's simpler emitters for the CPU take 10 to 40 % less time.
+    simpler = {"xla_cpu_use_fusion_emitters": False} if used[0].platform == "cpu" else {}
+
+    @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0, **simpler})
     def init_all(keys: Key[Array, "L"], hparams: HParams) -> TrainState:
         return init(pad(keys), pad(hparams))
 
-    @partial(jax.jit, donate_argnums=0)
+    @partial(jax.jit, donate_argnums=0, compiler_options=simpler)
     def warmup_all(states: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock]:
         return warmup(states, clock, pad(hparams))
 

@@ -221,8 +221,8 @@ def test_a_bonus_widens_the_clip_to_its_own_returns():
 
 def test_hyper_parameter_lanes_equal_separate_runs():
     cfg = config("apt_gen", **SWITCHES)
-    lanes = [HParams(delta=0.1, gamma=0.9), HParams(delta=0.9, gamma=0.5)]
-    several, _, _ = run(cfg, [1, 1], hparams=lanes, layout="vmap")
+    lanes = [HParams(delta=delta, gamma=gamma) for delta, gamma in ((0.1, 0.9), (0.9, 0.5), (0.1, 0.5), (0.5, 0.9), (0.9, 0.0))]
+    several, _, _ = run(cfg, [1] * 5, hparams=lanes, layout="vmap")
     for lane, hparams in enumerate(lanes):
         alone, _, _ = run(cfg, [1], hparams=[hparams])
         assert_lane_equal(several, lane, alone)
@@ -240,12 +240,13 @@ def test_seeds_differ():
 def test_nothing_compiles_after_the_first_chunk(method):
     """Neither in a longer run, nor for other seeds or hyper-parameters."""
     cfg = config(method, **SWITCHES)
-    run(cfg, [0, 1], chunks=1)
+    lanes = 5 if method == "apt_gen" else 2  # programs of other tests
+    run(cfg, range(lanes), chunks=1)
     compiled = []
     jax.monitoring.register_event_duration_secs_listener(
         lambda event, duration, **_: compiled.append(event) if "backend_compile" in event else None
     )
-    run(cfg, [5, 6], chunks=3, hparams=[HParams(delta=0.3), HParams(gamma=0.5)])
+    run(cfg, range(5, 5 + lanes), chunks=3, hparams=[HParams(delta=0.3), *[HParams(gamma=0.5)] * (lanes - 1)])
     assert not compiled
     jax.jit(lambda x: x + 1.5)(np.float32(2.0))
     assert compiled, "the listener must hear a compilation"
