@@ -13,6 +13,9 @@ import flax.struct
 Covariance = Literal["full", "diagonal"]
 """Of ALP-GMM's components."""
 
+BetaRule = Literal["doubling", "proportional"]
+"""How beta follows the return of generated tasks."""
+
 
 @flax.struct.dataclass
 class HParams:
@@ -157,6 +160,8 @@ class Config:
       blank_bias: head start of category 0 in the generator's initial grids, in standard deviations of the scores (paper: 0).
       value_ensemble: networks behind each of V1 and V2, whose estimate is their mean less `pessimism` deviations (paper: 1).
       noise_size: length of the generator's noise z.
+      beta_rule: "doubling" doubles or halves beta at each update outside the band of `tolerance` around `delta` (paper);
+        "proportional" makes it `beta_init` at `delta` and doubles it for every `tolerance` that the return is below.
       alp_window: finished episodes that ALP-GMM fits its mixtures to; until there are so many, tasks are uniform (its reference
         250).
       alp_history: earlier episodes among which it looks for the task nearest to each of these (its reference: all).
@@ -190,6 +195,7 @@ class Config:
     blank_bias: float = 0.0
     value_ensemble: int = 1
     noise_size: int = 32
+    beta_rule: BetaRule = "doubling"
     alp_window: int = 250
     alp_history: int = 2_000
     alp_fit_every: int = 5_000

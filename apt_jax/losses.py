@@ -77,3 +77,22 @@ def adapt_beta(
     doubled = jnp.minimum(beta * 2.0, high)
     halved = jnp.maximum(beta / 2.0, low)
     return jnp.where(episode_return < delta - tolerance, doubled, jnp.where(episode_return > delta + tolerance, halved, beta))
+
+
+def proportional_beta(
+    beta: Float[Array, ""],
+    episode_return: Float[Array, ""],
+    *,
+    neutral: Float[Array, ""] | float,
+    delta: Float[Array, ""] | float,
+    tolerance: Float[Array, ""] | float,
+    low: Float[Array, ""] | float,
+    high: Float[Array, ""] | float,
+) -> Float[Array, ""]:
+    """`neutral` at `delta`, twice as much for every `tolerance` that the return is below it, within [`low`, `high`].
+
+    The generator sums up what beta tells it: how hard tasks are follows beta's integral.  The paper's rule is a second integral
+    on top, which overshoots; this one adds none.  A NaN return (no finished episode) leaves beta as it is.
+    """
+    wanted = jnp.clip(neutral * jnp.exp2((delta - episode_return) / jnp.maximum(tolerance, 1e-6)), low, high)
+    return jnp.where(jnp.isnan(episode_return), beta, wanted)

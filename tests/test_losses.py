@@ -88,3 +88,15 @@ def test_generator_objective_is_equation_three():
 def test_beta_rule(beta, episode_return, expected):
     adapted = losses.adapt_beta(jnp.float32(beta), jnp.float32(episode_return), delta=0.5, tolerance=0.1, low=0.125, high=8.0)
     np.testing.assert_allclose(adapted, expected)
+
+
+@pytest.mark.parametrize(
+    ("episode_return", "expected"),
+    [(0.5, 1.5), (0.4, 3.0), (0.3, 6.0), (0.25, 8.0), (-1.0, 8.0), (0.6, 0.75), (0.9, 0.125), (float("nan"), 5.0)],
+)
+def test_proportional_beta(episode_return, expected):
+    """Twice as much for each 0.1 below delta, whatever beta was."""
+    adapted = losses.proportional_beta(
+        jnp.float32(5.0), jnp.float32(episode_return), neutral=1.5, delta=0.5, tolerance=0.1, low=0.125, high=8.0
+    )
+    np.testing.assert_allclose(adapted, expected, rtol=1e-5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ from apt_jax.config import Config, HParams
 from apt_jax.curricula.apt_gen_objectives import make_objectives, task_progress
 from apt_jax.curricula.base import GENERATED, TARGET, Curriculum, Metrics
 from apt_jax.descent import ADAM, descend
-from apt_jax.losses import adapt_beta
+from apt_jax.losses import adapt_beta, proportional_beta
 from apt_jax.networks import init_singular_vectors, spectral_normalize
 from apt_jax.networks.apply import apply
 from apt_jax.specs import Params, Spec, Vector, obs_struct, param_struct, zeros_like
@@ -157,7 +158,9 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
     ) -> AptGenState:
         del key, iterations
         outcome = rp.recent_outcome(replay, source=GENERATED, window=config.return_window, since=warm)
-        beta = adapt_beta(
+        proportional = partial(proportional_beta, neutral=hparams.beta_init)
+        adapt = proportional if config.beta_rule == "proportional" else adapt_beta
+        beta = adapt(
             state.beta,
             outcome["episode_return"],
             delta=hparams.delta,
