@@ -202,18 +202,25 @@ def generated_episodes(returns, ends):
 
 
 @pytest.mark.parametrize(
-    ("returns", "ends", "beta"),
+    ("rule", "returns", "ends", "beta"),
     [
-        ([-1.0, -1.0, 0.9], [3, 24, 25], 0.5),  # the warm-up lasts 25 iterations of 4 environments
-        ([0.9, 0.9, -1.0], [3, 24, 25], 2.0),
-        ([-1.0, -1.0], [3, 24], 1.0),
+        ("doubling", [-1.0, -1.0, 0.9], [3, 24, 25], 0.5),  # the warm-up lasts 25 iterations of 4 environments
+        ("doubling", [0.9, 0.9, -1.0], [3, 24, 25], 2.0),
+        ("doubling", [-1.0, -1.0], [3, 24], 1.0),
+        ("proportional", [-1.0, -1.0, 0.75], [3, 24, 25], 2.0**-2.5),
+        ("proportional", [-1.0, -1.0], [3, 24], 1.0),
     ],
 )
-def test_beta_follows_only_what_ended_after_the_warm_up(returns, ends, beta):
-    curriculum = apt_gen.make(SPACE, CONFIG)
+def test_beta_follows_only_what_ended_after_the_warm_up(rule, returns, ends, beta):
+    curriculum = apt_gen.make(SPACE, dataclasses.replace(CONFIG, beta_rule=rule))
     state = jax.eval_shape(curriculum.init, jax.random.key(0), HParams())._replace(beta=jnp.float32(1.0))
     refreshed = curriculum.refresh(state, jax.random.key(1), generated_episodes(returns, ends), jnp.int32(30), HParams())
-    assert refreshed.beta == beta
+    np.testing.assert_allclose(refreshed.beta, beta, rtol=1e-6)
+
+
+def test_an_unknown_rule_for_beta_is_refused():
+    with pytest.raises(ValueError, match="beta_rule must be one of doubling, proportional, got 'halving'"):
+        apt_gen.make(SPACE, dataclasses.replace(CONFIG, beta_rule="halving"))
 
 
 def test_rollouts_hold_the_steps_of_their_episode_only():

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import replay as rp
-from apt_jax.config import Config, HParams
+from apt_jax.config import BetaRule, Config, HParams
 from apt_jax.curricula.apt_gen_objectives import make_objectives, task_progress
 from apt_jax.curricula.base import GENERATED, TARGET, Curriculum, Metrics
 from apt_jax.descent import ADAM, descend
@@ -46,7 +46,12 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
     Args:
       progress_weight: of V1 in the generator's objective; 0 is the ablation "expected return only" (paper, Sec. 5.3).
       return_weight: of V2 there; 0 is the ablation "task progress only".
+
+    Raises:
+      ValueError: an unknown `Config.beta_rule`.
     """
+    if config.beta_rule not in get_args(BetaRule):
+        raise ValueError(f"beta_rule must be one of {', '.join(get_args(BetaRule))}, got {config.beta_rule!r}")
     objectives = make_objectives(space, config, progress_weight=progress_weight, return_weight=return_weight)
     networks = objectives.networks
     batch = config.model_batch_size
@@ -158,9 +163,8 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
     ) -> AptGenState:
         del key, iterations
         outcome = rp.recent_outcome(replay, source=GENERATED, window=config.return_window, since=warm)
-        proportional = partial(proportional_beta, neutral=hparams.beta_init)
-        adapt = proportional if config.beta_rule == "proportional" else adapt_beta
-        beta = adapt(
+        rules = {"doubling": adapt_beta, "proportional": partial(proportional_beta, neutral=hparams.beta_init)}
+        beta = rules[config.beta_rule](
             state.beta,
             outcome["episode_return"],
             delta=hparams.delta,
