@@ -65,30 +65,29 @@ def learning_curves(file: Path, settings: Mapping[str, Run], *, delta: float | N
 
 
 def comparison(file: Path, panels: Mapping[str, Mapping[str, Run]], *, metrics: Sequence[str] = ("target_return",)) -> None:
-    """Metrics of several runs, by panel and name: every seed thin, their mean thick, a standard deviation shaded.
+    """Metrics of several runs, by panel and name: every seed thin, their mean thick.
 
     A name has the same colour in every panel; a run that lacks a metric is left out there.
     """
     names = list(dict.fromkeys(name for runs in panels.values() for name in runs))
     count = len(panels) * len(metrics)
-    figure = Figure(figsize=(7 if count == 1 else 5 * count, 4), layout="constrained")
+    legend_columns = 3 * count
+    legend_height = 0.25 * -(-len(names) // legend_columns)
+    figure = Figure(figsize=(7 if count == 1 else 5 * count, 4 + legend_height), layout="constrained")
+    handles = {}
     columns = [(title, runs, metric) for title, runs in panels.items() for metric in metrics]
     for axes, (title, runs, metric) in zip(np.atleast_1d(figure.subplots(1, count)), columns, strict=True):
         for name, (env_steps, curves) in runs.items():
             if metric not in curves:
                 continue
             colour, values = f"C{names.index(name)}", np.ma.masked_invalid(curves[metric])
-            mean, deviation = values.mean(axis=0), values.std(axis=0)
-            if metric != "beta":  # which is drawn on a logarithmic scale
-                axes.fill_between(env_steps, mean - deviation, mean + deviation, color=colour, alpha=0.1, linewidth=0)
             for own in values:
                 axes.plot(env_steps, own, color=colour, linewidth=0.8, alpha=0.4)
-            axes.plot(env_steps, mean, color=colour, linewidth=2.5, label=name)
+            (handles[name],) = axes.plot(env_steps, values.mean(axis=0), color=colour, linewidth=2.5)
         _decorate(axes, metric)
         if title:
             axes.set_title(title, fontsize="medium")
-        if axes.lines:
-            axes.legend(fontsize="small")
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=legend_columns, fontsize="small")
     figure.savefig(file, dpi=150)
 
 

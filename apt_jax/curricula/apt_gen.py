@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, get_args
 
@@ -163,8 +164,9 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
     ) -> AptGenState:
         del key, iterations
         outcome = rp.recent_outcome(replay, source=GENERATED, window=config.return_window, since=warm)
-        rules = {"doubling": adapt_beta, "proportional": partial(proportional_beta, neutral=hparams.beta_init)}
-        beta = rules[config.beta_rule](
+        proportional = partial(proportional_beta, neutral=hparams.beta_init)
+        follow: Callable[..., Float[Array, ""]] = proportional if config.beta_rule == "proportional" else adapt_beta
+        beta = follow(
             state.beta,
             outcome["episode_return"],
             delta=hparams.delta,
