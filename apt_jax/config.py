@@ -161,7 +161,7 @@ class Config:
       value_ensemble: networks behind each of V1 and V2, whose estimate is their mean less `pessimism` deviations (paper: 1).
       noise_size: length of the generator's noise z.
       beta_rule: "doubling" doubles or halves beta at each update outside the band of `tolerance` around `delta` (paper);
-        "proportional" makes it `beta_init` at `delta` and doubles it for every `tolerance` that the return is below.
+        "proportional" sets it to beta_init * 2^((delta - return) / tolerance), within [beta_min, beta_max].
       alp_window: finished episodes that ALP-GMM fits its mixtures to; until there are so many, tasks are uniform (its reference
         250).
       alp_history: earlier episodes among which it looks for the task nearest to each of these (its reference: all).

@@ -29,7 +29,7 @@ class Args:
       target: a target's name, or a file that describes one; by default the one trained on.
       target_file: a file that describes the target task, whatever `target` says.
       episodes: greedy episodes per lane.
-      seed: of the episodes' initial states.
+      seed: random seed of the episodes' initial states.
       gif: where to put a film of the best lane.
       robot: have the Sawyer arm play the film's episode, in Manipulation (see experiments.film).
     """

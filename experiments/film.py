@@ -21,6 +21,7 @@ from experiments import episodes, runtime
 from experiments.episodes import Episode
 from experiments.errors import UsageError, check_folder, exit_with
 from experiments.problem import load_target
+from experiments.settings import target_path
 
 FPS = 2.0
 """Pushes per second of a film without the robot."""
@@ -32,9 +33,9 @@ class Args:
 
     Attributes:
       out: the GIF to write.
-      target: a target's name.
-      target_file: a file that describes the target task, instead of a name.
-      seed: of the goal's place.
+      target: a target's name, or a file that describes it.
+      target_file: a file that describes the target task, whatever `target` says.
+      seed: random seed of the goal's place.
       above: show the table from above, one picture per push, in any case.
     """
 
@@ -60,10 +61,11 @@ def film(args: Args) -> None:
         space = Space()
     except ValueError as error:
         raise UsageError(str(error)) from error
-    task = load_target(space.name, args.target, args.target_file)
-    actions = solve(task, space.goal_jitter) if args.target_file else DEMONSTRATIONS[args.target]
+    file = args.target_file or target_path(space.name, args.target)
+    task = load_target(space.name, args.target, file)
+    actions = solve(task, space.goal_jitter) if file else DEMONSTRATIONS[args.target]
     if actions is None:
-        raise UsageError(f"{args.target_file}: found no solution to film")
+        raise UsageError(f"{file}: found no solution to film")
     sequence = jnp.asarray(actions)
     episode = episodes.play(space, task, lambda _, step: sequence[step], jax.random.key(args.seed))
     save(args.out, space, task, episode, robot=not args.above)

@@ -52,7 +52,7 @@ class Args:
       run_dir: a run of APT-Gen.
       periods: evaluation periods to go on for.
       tasks: that the frozen policies play in each.
-      seed: of those tasks and of the policies' exploration.
+      seed: random seed of those tasks and of the policies' exploration.
     """
 
     run_dir: Path

@@ -15,7 +15,7 @@ RETRIES = 3
 def check_installed() -> None:
     """Raises a `UsageError` that names the extra if Ray is missing."""
     if importlib.util.find_spec("ray") is None:
-        raise UsageError("--ray needs ray: pip install 'apt-jax[ray]'")
+        raise UsageError("--ray needs ray: pip install -e '.[ray]'")
 
 
 def on_ray(work: Callable[..., int], jobs: Sequence[tuple[Any, ...]], *, cpus: int, gpus: float) -> list[int | Exception]:

@@ -22,7 +22,7 @@ class Args:
       space: the task space.
       rows: rows of tasks.
       columns: columns of tasks.
-      seed: of the tasks.
+      seed: random seed of the tasks.
     """
 
     out: Path

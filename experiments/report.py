@@ -20,7 +20,7 @@ SOLVED = 0.9
 HEADER = (
     "run",
     "steps",
-    "final return by seed (mean ± deviation)",
+    "kept return by seed (mean ± deviation)",
     "interquartile mean (95 % interval)",
     "before the restore rule",
     f"first steps above {SOLVED:g}",

@@ -67,13 +67,13 @@ class Session:
     Attributes:
       run_dir: where everything is written; must be new, empty, or resumed.
       resume: go on from the run directory's checkpoint; the experiment defaults to what is saved there.
-      preset: the config and hparams to start from (paper, unless a run is resumed), but for a gamma of the space's own; other
-        options override single fields.
+      preset: the config and hparams to start from, by default paper or what a resumed run was started with, but for a gamma of
+        the space's own; other options override single fields.
       method: short for --config.method: apt_gen, apt_gen_progress_only, apt_gen_return_only, random, alp_gmm, goal_gan, dqn,
         icm, rnd, ride, or one with a bonus added as in "apt_gen+rnd".
       layout: how the lanes of one device are laid out; by default map on CPU and vmap on accelerators.
-      at_once: lanes of a device side by side under layout vmap, the others in turn, if all do not fit its memory; layout map,
-        the one of CPUs, has one at a time anyway.
+      at_once: with layout vmap, how many lanes of a device run at the same time, by default as many as fit its memory; layout
+        map, the one of CPUs, runs one at a time anyway.
       devices: devices the host CPU counts as, by default one per core; lanes are spread over them.
       distributed: this is one of several processes, each started with the same options, that share lanes and run directory; on
         SLURM, Open MPI, Kubernetes and TPU pods they find each other, elsewhere with the next three options.

@@ -41,7 +41,7 @@ class Signs:
 
     Attributes:
       runs: directories of runs with a generator; a run is called by its directory's name.
-      after: environment steps from which the other columns are averaged.
+      after: columns that are one number average over the evaluations after so many environment steps.
     """
 
     runs: tuple[Path, ...]

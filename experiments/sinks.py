@@ -75,7 +75,7 @@ def check_installed(names: Sequence[str]) -> None:
     """Raises a `UsageError` that names the extra of a missing package."""
     for name in names:
         if importlib.util.find_spec(_MODULES[name]) is None:
-            raise UsageError(f"--sinks {name} needs {_MODULES[name]}: pip install 'apt-jax[{name}]'")
+            raise UsageError(f"--sinks {name} needs {_MODULES[name]}: pip install -e '.[{name}]'")
 
 
 def make_sinks(

@@ -302,6 +302,13 @@ class TestFilm:
         assert gif_frames(tmp_path / "film.gif") == (len(DEMONSTRATIONS["A"]) + 1, (192, 128))
         assert "libegl1" in capsys.readouterr().err
 
+    def test_a_target_may_be_a_file(self, tmp_path):
+        file = tmp_path / "one_push.txt"
+        file.write_text("FFFFFF\nFFFFFF\nFFFFFF\nFFFFFF\ngoal 45 37\ncan 45 30\nrange 10")
+        film.film(film.Args(tmp_path / "film.gif", target=str(file), above=True))
+        frames, _ = gif_frames(tmp_path / "film.gif")
+        assert 2 <= frames <= 4
+
     def test_a_missing_backend_is_told_before_anything_else(self, monkeypatch):
         """MuJoCo then fails to be imported; None in its place makes it fail wherever the libraries are."""
         monkeypatch.setenv("MUJOCO_GL", "osmesa")
