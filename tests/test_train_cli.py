@@ -216,7 +216,7 @@ def test_rewinding_drops_what_came_after_the_checkpoint(tmp_path):
 
 def test_a_missing_sink_names_its_extra(monkeypatch):
     monkeypatch.setitem(sinks._MODULES, "wandb", "a_module_that_does_not_exist")
-    with pytest.raises(UsageError, match=r"pip install 'apt-jax\[wandb\]'"):
+    with pytest.raises(UsageError, match=r"pip install -e '.\[wandb\]'"):
         sinks.check_installed(["wandb"])
 
 
