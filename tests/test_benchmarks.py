@@ -100,6 +100,8 @@ def test_results_of_a_training_step_are_json_and_a_table(result):
     text = training_step.tables({"tiny": result, "same": result}, rate=1e9)
     assert "| part | tiny: ms | tiny: of the sum | tiny: compile, s | same: ms |" in text
     assert "| sum of the parts |" in text
+    evaluate = next(line for line in text.splitlines() if line.startswith("| evaluate |"))
+    assert [cell.strip() for cell in evaluate.split("|")[4:8:3]] == ["", ""], "an evaluation is never compiled by itself"
     ratio = f"{result.chunk.median / result.sum_of_parts:.2f}"
     assert f"Whole / sum of the parts: {ratio} (tiny), {ratio} (same)." in text
 

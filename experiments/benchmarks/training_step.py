@@ -154,7 +154,7 @@ def measure(problem: Problem, args: Args) -> Result:
     single = problem._replace(config=dataclasses.replace(config, refresh_every=steps, eval_every=steps))
     shortest, _ = time_chunk(single, state, clock, args.repeats)
     others = sum(timing.median for timing in timings.values())
-    evaluation = dataclasses.replace(shortest, seconds=tuple(max(seconds - others, 0.0) for seconds in shortest.seconds))
+    evaluation = Timing(tuple(max(seconds - others, 0.0) for seconds in shortest.seconds), 0.0)  # never compiled by itself
     parts["evaluate"] = evaluation.per(config.eval_every)
 
     chunk = chunk.per(config.eval_every)
@@ -254,7 +254,11 @@ def part_rows(result: Result) -> Rows:
     training = chunk.median - result.parts["evaluate"].median
     return {
         **{
-            name: [timing.cell(), f"{timing.median / total:.1%}", f"{timing.compile_seconds:.1f}"]
+            name: [
+                timing.cell(),
+                f"{timing.median / total:.1%}",
+                f"{timing.compile_seconds:.1f}" if timing.compile_seconds else "",
+            ]
             for name, timing in result.parts.items()
         },
         "sum of the parts": [_measure.number(total * 1e3), "100.0%", ""],
