@@ -34,6 +34,9 @@ def restore(directory: Path, template: Tree) -> Tree:
     Args:
       directory: where `save` wrote.
       template: arrays, or `ShapeDtypeStruct`s with a sharding: structure, shapes, dtypes and placement of the result.
+
+    Raises:
+      CheckpointError: there is none, or it cannot be read as that.
     """
     step = _require_step(directory)
     abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), template)
@@ -42,7 +45,11 @@ def restore(directory: Path, template: Tree) -> Tree:
 
 
 def rows(directory: Path) -> int:
-    """The leading axis that all arrays of the latest checkpoint share, scalars aside."""
+    """The leading axis that all arrays of the latest checkpoint share, scalars aside.
+
+    Raises:
+      CheckpointError: there is no checkpoint, or it cannot be read.
+    """
     step = _require_step(directory)
     with _readable(directory, step):
         saved = ocp.StandardCheckpointHandler().metadata(directory.resolve() / str(step) / "default")

@@ -40,7 +40,8 @@ class HParams:
       value_weight_decay: decoupled weight decay of the value networks, per unit of their learning rate, >= 0.
       recency: how much discriminator and values prefer recent generated episodes (`replay.sample_rollouts`), >= 1; 1 draws
         uniformly from the window (paper).
-      cell_noise: probability that a cell of a generated grid is played with a uniformly drawn category, in [0, 1] (paper: 0).
+      cell_noise: probability that a cell of a generated grid, or a row of a table, is played with a uniformly drawn category,
+        in [0, 1] (paper: 0).
       vector_noise: standard deviation of the noise on generated vectors, as a share of their range, >= 0 (paper: 0).
       vector_prior: weight of the divergence of generated vectors from a fresh generator's, which keeps numbers off the ends of
         their range and different from task to task, >= 0 (paper: 0).
@@ -118,15 +119,21 @@ def check_hparams(hparams: HParams) -> None:
         "recency": (1.0, math.inf, "at least 1"),
         "delta": (-sys.float_info.max, sys.float_info.max, "finite"),
         **dict.fromkeys(positive, (math.ulp(0.0), math.inf, "above 0")),
-        **dict.fromkeys(not_negative + rates + scales, (0.0, math.inf, "at least 0")),
+        **dict.fromkeys(not_negative, (0.0, math.inf, "at least 0")),
+        **dict.fromkeys(rates + scales, (0.0, sys.float_info.max, "finite and at least 0")),
         **dict.fromkeys(shares, (0.0, 1.0, "in [0, 1]")),
     }
     for name, (low, high, allowed) in ranges.items():
         value = getattr(hparams, name)
         if not low <= value <= high:
             raise ValueError(f"{name} must be {allowed}, got {value:g}")
+    if hparams.beta_min > hparams.beta_max:
+        raise ValueError(f"beta_min must be at most beta_max={hparams.beta_max:g}, got {hparams.beta_min:g}")
     if not hparams.beta_min <= hparams.beta_init <= hparams.beta_max:
         raise ValueError(f"beta_init must lie in [beta_min, beta_max], got {hparams.beta_init:g}")
+    shrink = hparams.value_learning_rate * hparams.value_weight_decay
+    if shrink > 1.0:
+        raise ValueError(f"value_learning_rate * value_weight_decay must be at most 1, got {shrink:g}")
     if hparams.goal_low > hparams.goal_high:
         raise ValueError(f"goal_low must be at most goal_high={hparams.goal_high:g}, got {hparams.goal_low:g}")
 

@@ -21,7 +21,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Int, Key
 
-from apt_jax.config import HParams
+from apt_jax.config import HParams, check_hparams
 from apt_jax.curricula.base import Metrics
 from apt_jax.trainer import Clock, Trainer, TrainState
 from apt_jax.turns import Turns
@@ -46,7 +46,13 @@ class Program(NamedTuple):
 
 
 def stack_hparams(hparams: Sequence[HParams]) -> HParams:
-    """HParams of single lanes as one with leaves float32 [L]."""
+    """HParams of single lanes as one with leaves float32 [L].
+
+    Raises:
+      ValueError: a value out of its range (`check_hparams`).
+    """
+    for lane in hparams:
+        check_hparams(lane)
     return jax.tree.map(lambda *leaves: np.asarray(leaves, np.float32), *hparams)
 
 

@@ -58,8 +58,8 @@ def make_method(space: TaskSpace, config: Config) -> tuple[Curriculum, Bonus]:
       ValueError: an unknown name, or sizes that its parts cannot work with.
     """
     method = parse_method(config.method)
-    curriculum = CURRICULA[method.curriculum](space, config)
-    bonus = BONUSES[method.bonus](space, config)
+    curriculum = look_up(CURRICULA, method.curriculum, "curriculum")(space, config)
+    bonus = look_up(BONUSES, method.bonus, "bonus")(space, config)
     if method.bonus != "none" and config.n_step != 1:
         raise ValueError(f"n_step must be 1 with the bonus {method.bonus!r}, which pays single steps, got {config.n_step}")
     return curriculum, bonus

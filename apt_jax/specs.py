@@ -6,6 +6,7 @@ dicts of arrays with the same names.  Networks are built from specs alone, so a 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -29,8 +30,8 @@ class Vector:
     dtype: str = "float32"
 
     def __post_init__(self) -> None:
-        if self.size < 1 or not self.low < self.high:
-            raise ValueError(f"Vector needs size >= 1 and low < high, got {self}")
+        if self.size < 1 or not -math.inf < self.low < self.high < math.inf:
+            raise ValueError(f"Vector needs size >= 1 and finite low < high, got {self}")
 
     @property
     def scale(self) -> float:

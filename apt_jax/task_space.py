@@ -29,6 +29,13 @@ class TaskSpace(Protocol):
 
     `w` (learned parameters, described by `param_spec`) and `task` (a concrete MDP, any pytree of arrays) are different types,
     because a target may lie outside the space: a target is a task.  All methods are pure, jittable and unbatched.
+
+    Attributes:
+      name: what messages and files call it.
+      obs_spec: modalities of an observation.
+      param_spec: modalities of `w`.
+      num_actions: discrete actions, at most 256.
+      horizon: steps after which an episode is over at the latest; the replay relies on `step` to end it.
     """
 
     name: str

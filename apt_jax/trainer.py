@@ -24,7 +24,7 @@ from apt_jax.config import Config, HParams
 from apt_jax.curricula.base import GENERATED, TARGET, Metrics, no_update
 from apt_jax.methods import make_method
 from apt_jax.networks import QNetwork
-from apt_jax.specs import Grid, Obs, Params, Spec, Table, Vector, param_struct
+from apt_jax.specs import Grid, Obs, Params, Spec, Table, Vector, obs_struct, param_struct
 from apt_jax.task_space import TaskSpace
 
 _REFRESH_STREAM = 1_000_033
@@ -32,7 +32,7 @@ _REFRESH_STREAM = 1_000_033
 
 
 class Clock(NamedTuple):
-    """How far training has come, the same for all seeds: iterations and environment steps of all sources."""
+    """How far training has come, the same for all seeds: iterations and environment steps of all sources, below 2^31."""
 
     iteration: Int[Array, ""]
     env_steps: Int[Array, ""]
@@ -85,9 +85,11 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
     """The trainer of a configuration for one target task of `space`.
 
     Raises:
-      ValueError: an unknown method, or sizes that do not fit together (what, and what is allowed).
+      ValueError: an unknown method, sizes that do not fit together (what, and what is allowed), or a space or target that
+        is not what its specs say.
     """
     check_counts(config)
+    check_space(space)
     check_target(space, target)
     curriculum, bonus = make_method(space, config)
     sources = 2 if curriculum.generates else 1
@@ -268,6 +270,8 @@ def check_counts(config: Config) -> None:
     """
     counts = (
         "envs_per_source",
+        "refresh_every",
+        "eval_every",
         "updates_per_step",
         "n_step",
         "replay_episodes",
@@ -351,6 +355,24 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
         f"replay_steps must be a multiple of envs_per_source and hold recent_steps and one more horizon: at least {needed}, "
         f"got {config.replay_steps}",
     )
+
+
+def check_space(space: TaskSpace) -> None:
+    """Check that a space draws parameters, and begins with observations, of the shapes and dtypes of its specs.
+
+    Raises:
+      ValueError: which method returns something else, and what is expected.
+    """
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    w = jax.eval_shape(space.sample_uniform, key)
+    task = jax.eval_shape(space.instantiate, param_struct(space.param_spec))
+    _, obs = jax.eval_shape(space.reset, key, task)
+    for name, given, expected in (
+        ("sample_uniform must return", w, param_struct(space.param_spec)),
+        ("reset must return observations like", obs, obs_struct(space.obs_spec)),
+    ):
+        if given != expected:
+            raise ValueError(f"{space.name}.{name} {expected}, got {given}")
 
 
 def check_target(space: TaskSpace, target: Any) -> None:

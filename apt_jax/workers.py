@@ -73,8 +73,13 @@ def step(
     Returns:
       The workers after the reset, the transitions with their true final observations, the true final states, the episodes as
       they would end with this step, and which of them did.
+
+    Raises:
+      ValueError: while traced, if the space's step returns observations or a reward of another shape or dtype.
     """
     out = _grid(space.step)(workers.state, action, workers.task)
+    _check_like(out.obs, workers.obs, f"{space.name}.step must return observations like reset")
+    _check_like(out.reward, workers.episode_return, f"{space.name}.step must return a float32 reward")
     done = out.terminated | out.truncated
     length = workers.length + 1
     episode_return = workers.episode_return + out.reward
@@ -92,6 +97,13 @@ def step(
         assignment = _where(again, Assignment(workers.task, workers.w), assignment)
         fresh = start(space, assignment, key)._replace(played=jnp.where(again, played, 0))
     return _where(done, fresh, going_on), transition, out.state, episode, done
+
+
+def _check_like(given: Any, expected: Any, message: str) -> None:
+    """The replay would cast in silence."""
+    structs = [jax.tree.map(lambda x: (x.shape, x.dtype.name), tree) for tree in (given, expected)]
+    if structs[0] != structs[1]:
+        raise ValueError(f"{message}, {structs[1]}, got {structs[0]} (shapes with the axes of sources and environments)")
 
 
 def _where(condition: Bool[Array, "S E"], new: Any, old: Any) -> Any:

@@ -21,7 +21,7 @@ from experiments import episodes, runtime
 from experiments.episodes import Episode
 from experiments.errors import UsageError, check_folder, exit_with
 from experiments.problem import load_target
-from experiments.settings import target_path
+from experiments.settings import make_space, target_path
 
 FPS = 2.0
 """Pushes per second of a film without the robot."""
@@ -73,7 +73,7 @@ def film(args: Args) -> None:
 
 def check_robot(space: str) -> None:
     """Raises a `UsageError` unless the arm plays a space."""
-    if not isinstance(envs.make(space), Space):
+    if not isinstance(make_space(space), Space):
         raise UsageError(f"the robot plays {Space.name}, not {space}")
 
 

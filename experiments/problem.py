@@ -11,7 +11,7 @@ import envs
 from apt_jax.config import Config
 from apt_jax.trainer import Trainer, make_trainer
 from experiments.errors import UsageError
-from experiments.settings import Experiment
+from experiments.settings import Experiment, make_space
 
 
 class Problem(NamedTuple):
@@ -45,7 +45,7 @@ def make_problem(experiment: Experiment) -> Problem:
     """Imports plug-ins and checks every name and size before anything is compiled; raises a `UsageError`."""
     import_plugins(experiment.plugins)
     target = load_target(experiment.space, experiment.target, experiment.target_file)
-    space = envs.make(experiment.space)
+    space = make_space(experiment.space)
     try:
         problem = Problem(space, target, make_trainer(space, target, experiment.config))
     except ValueError as error:
@@ -55,7 +55,9 @@ def make_problem(experiment: Experiment) -> Problem:
 
 
 def check_env_steps(env_steps: int, config: Config) -> None:
-    """Raises a `UsageError` unless warm-up and a whole number of chunks make up `env_steps`."""
+    """Raises a `UsageError` unless warm-up and a whole number of chunks make up `env_steps`, and the clock can count so far."""
+    if env_steps >= 2**31:
+        raise UsageError(f"--env-steps must be below 2^31, got {env_steps}")
     chunks = max(round((env_steps - config.warmup_steps) / config.eval_every), 1)
     closest = config.warmup_steps + chunks * config.eval_every
     if env_steps != closest:

@@ -172,11 +172,25 @@ def _read_rows(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(line for line in lines if line.endswith("\n")))
 
 
+def _check_header(file: Path, names: Sequence[str]) -> None:
+    """Raises a `UsageError` unless those are the columns of a file."""
+    with file.open(newline="") as stream:
+        header = next(csv.reader(stream))
+    if header != list(names):
+        different = ", ".join(sorted({*header} ^ {*names})) or "in another order"
+        raise UsageError(
+            f"{file} has other columns ({different}): another version began it; go on with that one, or in another --run-dir"
+        )
+
+
 def _write_rows(file: Path, rows: Sequence[Mapping[str, object]], mode: str) -> None:
+    names = list(rows[0])
     with file.open(mode, newline="") as stream:
-        writer = csv.DictWriter(stream, fieldnames=list(rows[0]))
+        writer = csv.DictWriter(stream, fieldnames=names)
         if stream.tell() == 0:
             writer.writeheader()
+        else:
+            _check_header(file, names)
         writer.writerows(rows)
         stream.flush()
         os.fsync(stream.fileno())

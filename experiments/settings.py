@@ -162,9 +162,17 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
     return experiment, session
 
 
+def make_space(name: str) -> envs.BenchmarkSpace:
+    """The task space called `name`; raises a `UsageError` if there is none, or this machine lacks what it needs."""
+    try:
+        return envs.make(name)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
 def target_path(space: str, target: str) -> Path | None:
     """The file that `target` is, if it is one and no target of the space has this name."""
-    if not Path(target).is_file() or (space in envs.SPACES and target in envs.make(space).targets):
+    if not Path(target).is_file() or (space in envs.SPACES and target in make_space(space).targets):
         return None
     return Path(target)
 

@@ -14,7 +14,19 @@ import pytest
 
 from envs.manipulation import scene
 from envs.manipulation.placement import ground_of, roadblocks
-from envs.manipulation.push import GAP, REST_SPEED, STEPS, STROKE, STROKE_SECONDS, TOOL_RADIUS, TOOL_START, at_rest, simulate
+from envs.manipulation.push import (
+    GAP,
+    REST_SPEED,
+    STEPS,
+    STROKE,
+    STROKE_SECONDS,
+    TOOL_RADIUS,
+    TOOL_START,
+    Drive,
+    at_rest,
+    push,
+    simulate,
+)
 from envs.manipulation.table import BLOCK, CAN_RADIUS, DIRECTIONS, Task
 from experiments.benchmarks import _true_shapes
 from experiments.benchmarks.manipulation import same_model
@@ -144,6 +156,18 @@ class TestPush:
         np.testing.assert_array_equal(outcome.position[0], task.cans[GREEN])
         assert not outcome.hit
         assert not outcome.fell
+
+    def test_a_simulation_that_comes_apart_is_a_fall_where_it_still_held_together(self):
+        def advance(motion, supported):
+            moved = motion._replace(qpos=motion.qpos.at[0].add(0.001), steps=motion.steps + 1)
+            broken = motion._replace(qpos=motion.qpos * jnp.nan)
+            return jax.tree.map(lambda a, b: jnp.where(motion.steps < 10, a, b), moved, broken)
+
+        task = table((30, 20))
+        drive = Drive(at_rest(), 1, advance)
+        outcome = push(task, task.cans, task.present, can=BLUE, direction=RIGHT, arm=lambda place, ahead: drive)
+        assert (bool(outcome.fell), bool(outcome.hit)) == (True, False)
+        np.testing.assert_allclose(outcome.position, [0.31, 0.20], atol=1e-6)
 
     def test_an_outcome_does_not_depend_on_what_is_pushed_beside_it(self):
         cases = random_cases(8, seed=1)

@@ -128,6 +128,8 @@ class TestTables:
             ("can 36.9 37.2", "can 16 31", "line 6, column 5: the can, of radius 4.25, stands in another can"),
             ("can 57.2 22.1", "can 57.2 22.1\ncan 80 10", "line 8, column 1: a fourth 'can', allowed are 3"),
             ("range 10", "range 61", "line 8, column 7: range must be 10 to 60, got 61"),
+            ("range 10", "range 10\ngoal 700 210", "line 9, column 6: the goal's x must be 0 to 90, got 700"),
+            ("range 10", "range 10\ngoal 30 -1", "line 9, column 6: the goal's y must be 0 to 60, got -1"),
             ("range 10", "range 10\nrange 12", "line 9, column 1: a second 'range'"),
             ("range 10", "", "no 'range' in the table"),
             ("range 10", "range 10\nbox 14 30 5 5 5 0", "line 5, column 5: the can, of radius 4.25, stands in an obstacle"),

@@ -59,6 +59,11 @@ def start_run(path: Path, *options: str) -> Experiment:
         ("--checkpoint-every 0", "--checkpoint-every must be at least 1"),
         ("--target-file missing.txt", "missing.txt is no file"),
         ("--env-steps 10000", r"warmup_steps \(10000\) .* is 11000"),
+        ("--env-steps 2147484000", r"--env-steps must be below 2\^31, got 2147484000"),
+        ("--hparams.learning-rate inf", "learning_rate must be finite and at least 0, got inf"),
+        ("--hparams.beta-min 9", "beta_min must be at most beta_max=8, got 9"),
+        ("--hparams.value-weight-decay 5000", "value_learning_rate .* at most 1, got 1.5"),
+        ("--method alp_gmm --config.refresh-every 0", "refresh_every must be at least 1, got 0"),
         ("--env-steps 20400", r"eval_every \(1000\); closest to 20400 is 20000"),
         ("--space gird_world", "closest is 'grid_world'"),
         ("--plugins experiments.laddr", "--plugins experiments.laddr: No module named 'experiments.laddr'"),
@@ -122,6 +127,15 @@ def test_several_values_are_a_sweep_over_every_seed(tmp_path):
     assert settings.parse(["--run-dir", str(tmp_path), "--resume"])[0] == experiment
     with pytest.raises(UsageError, match=r"hparams.delta \(saved \(-0.1, .*, asked 0.5\)"):
         settings.parse(["--run-dir", str(tmp_path), "--resume", "--hparams.delta", "0.5"])
+
+
+def test_rows_with_other_columns_are_refused_and_what_is_there_stays(tmp_path):
+    run = RunDir.create(tmp_path / "run", {}, None)
+    run.append_metrics(100, 0.5, [{"seed": 0}], {"target_return": np.float32([1])})
+    before = (run.path / "metrics.csv").read_text()
+    with pytest.raises(UsageError, match=r"other columns \(beta\)"):
+        run.append_metrics(200, 0.5, [{"seed": 0}], {"beta": np.float32([1]), "target_return": np.float32([1])})
+    assert (run.path / "metrics.csv").read_text() == before
 
 
 def test_rows_of_a_sweep_are_told_apart_by_their_columns(tmp_path):

@@ -123,6 +123,47 @@ def test_metrics_are_finite_and_the_clock_counts_every_source(method):
             assert np.isfinite(value).all() or name.startswith(("behaviour_", "generated_")), name
 
 
+class Casting(Corridor):
+    """Its observations begin with another dtype than its spec names."""
+
+    def _observe(self, position, goal):
+        return jax.tree.map(jnp.float32, super()._observe(position, goal))
+
+
+class Paying(Corridor):
+    """Its steps pay whole numbers."""
+
+    def step(self, state, action, task):
+        out = super().step(state, action, task)
+        return out._replace(reward=out.reward.astype(jnp.int32))
+
+
+def test_a_space_that_is_not_what_its_specs_say_is_refused():
+    """The replay would cast in silence."""
+    with pytest.raises(ValueError, match=r"corridor.reset must return observations like .*uint8.*, got .*float32"):
+        make_trainer(Casting(), TARGET, CONFIG)
+    trainer = make_trainer(Paying(), TARGET, CONFIG)
+    with pytest.raises(ValueError, match=r"corridor.step must return a float32 reward, .*got .*int32"):
+        jax.eval_shape(make_program(trainer, 1).warmup, *lane_struct(trainer))
+
+
+def lane_struct(trainer):
+    lanes = stack_hparams([HParams()])
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 1))
+    return jax.eval_shape(make_program(trainer, 1).init, keys, lanes), Clock.start(), lanes
+
+
+def test_hparams_out_of_range_are_refused():
+    with pytest.raises(ValueError, match=r"gamma must be in \[0, 1\], got 1.5"):
+        stack_hparams([HParams(), HParams(gamma=1.5)])
+
+
+def test_a_method_of_unknown_parts_is_refused(monkeypatch):
+    monkeypatch.setitem(METHODS, "mine", Method("alp-gmm"))
+    with pytest.raises(ValueError, match="unknown curriculum 'alp-gmm'; closest is 'alp_gmm'"):
+        make_trainer(SPACE, TARGET, config("mine"))
+
+
 def test_a_target_of_another_shape_is_refused():
     with pytest.raises(ValueError, match="must look like a task of corridor"):
         make_trainer(SPACE, np.zeros(3, np.int32), CONFIG)

@@ -35,6 +35,7 @@ from envs.manipulation.table import (
     ROADBLOCK,
     ROADBLOCK_HEIGHT,
     ROWS,
+    SIZE,
     Obstacles,
     Task,
     distances,
@@ -91,6 +92,10 @@ def parse_table(text: str) -> Task:
         _check_stands(entry.line, cans[: index + 1], ground, obstacles)
 
     goal = _single(entries, "goal")
+    if goal:
+        for axis, value, side in zip("xy", goal.values, SIZE, strict=True):
+            if not 0 <= value <= 100 * side:
+                _refuse(goal.line, 6, f"the goal's {axis} must be 0 to {100 * side:g}, got {value:g}")
     goal_range = _single(entries, "range")
     if goal_range is None:
         raise ValueError("no 'range' in the table")

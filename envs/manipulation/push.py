@@ -125,8 +125,11 @@ def push(
 
     def advance(motion: Motion) -> Motion:
         moved = drive.advance(motion, supported)
+        # A simulation that has come apart is a fall from where it still held together, and its NaN goes no further.
+        sound = jnp.all(jnp.isfinite(moved.qpos)) & jnp.all(jnp.isfinite(moved.qvel))
+        moved = jax.tree.map(lambda new, old: jnp.where(sound, new, old), moved, motion)
         x, y, z = moved.qpos[:3]
-        fell = (z < -SUNK) | (tilt_cosine(moved.qpos) < FALL_COSINE)
+        fell = ~sound | (z < -SUNK) | (tilt_cosine(moved.qpos) < FALL_COSINE)
         hit = clearance(task, cans, others, to_table(jnp.stack([x, y])[None])[0]) < CAN_RADIUS
         return moved._replace(fell=fell, hit=hit & ~fell)
 
