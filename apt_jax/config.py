@@ -45,7 +45,8 @@ class HParams:
       vector_noise: standard deviation of the noise on generated vectors, as a share of their range, >= 0 (paper: 0).
       vector_prior: weight of the divergence of generated vectors from a fresh generator's, which keeps numbers off the ends of
         their range and different from task to task, >= 0 (paper: 0).
-      spectral_bound: upper bound of the spectral norm of every layer of the discriminator, > 0 (paper: none).
+      spectral_bound: upper bound of the spectral norm, as estimated, of every kernel matrix of the discriminator, > 0 (paper:
+        none).
       bonus_learning_rate: Adam step size of the networks behind an intrinsic reward, >= 0 (paper: 3e-4; RND's own 1e-4).
       icm_scale: factor on ICM's reward, >= 0 (its reference 0.01).
       rnd_scale: factor on RND's reward, >= 0 (its reference 1 beside rewards from the environment times 2).
@@ -155,8 +156,9 @@ class Config:
       n_step: rewards summed up before the Q-learning target bootstraps (the paper names none: 1).
       replay_steps: capacity of each source's replay, in steps of that source.
       replay_episodes: capacity of each source's ring of finished episodes.
-      model_updates_per_step: updates of discriminator, values and generator per environment step (paper: 1).
-      model_batch_size: rollouts per source in such an update (paper: 128).
+      model_updates_per_step: rounds of updates of what is learned besides the policy (discriminator, values and generator; the
+        networks of a bonus; GoalGAN's) per environment step (paper: 1).
+      model_batch_size: rollouts per source in such a round (paper: 128); steps of all sources for a bonus, tasks for GoalGAN.
       rollout_steps: transitions of each rollout that the discriminator sees in one update.
       judge_parts: whether the discriminator classifies the parts of a rollout one by one, as PatchGAN does those of a picture:
         the initial observation and each transition by themselves; a rollout's score averages their probabilities, of which the

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import jax
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 Params = TypeVar("Params")
 
@@ -23,3 +23,8 @@ def adam_step(params: Params, opt_state: Any, grads: Params, rate: Float[Array, 
     """Parameters and Adam's state after a step of size `rate` against `grads`, a pytree like `params`."""
     direction, opt_state = ADAM.update(grads, opt_state)
     return descend(params, direction, rate), opt_state
+
+
+def has_learned(opt_state: Any) -> Bool[Array, ""]:
+    """Whether Adam has made a step."""
+    return opt_state.count > 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,7 @@ from apt_jax.bonuses.moments import Moments
 from apt_jax.config import Config, HParams
 from apt_jax.lanes import make_program, stack_hparams
 from apt_jax.networks import Dynamics
+from apt_jax.replay import ReturnRange
 from apt_jax.trainer import Clock, make_trainer
 from tests.corridor import Corridor
 from tests.lock import Lock
@@ -164,13 +167,22 @@ def test_rnd_pays_nothing_where_predictor_and_target_agree(monkeypatch):
     np.testing.assert_allclose(metrics["extrinsic_reward"], 0.25)
 
 
-def test_the_stream_ranges_over_whole_episodes_bonus_included():
+def test_the_stream_sums_whole_episodes_bonus_included():
     stream = Stream.start((1, 2))
     for reward, done in (([1.0, -2.0], [False, False]), ([0.5, 1.0], [True, False]), ([9.0, 0.25], [False, True])):
-        stream = stream.step(jnp.array([reward]), jnp.array([done]))
-    np.testing.assert_allclose(stream.returns.bounds(), (-0.75, 1.5))
+        stream = stream.step(jnp.array([reward]), jnp.array([done]), learning=jnp.bool(True))
+    np.testing.assert_allclose(stream.highest, 1.5)
     np.testing.assert_allclose(stream.episode_return, [[9.0, 0.0]])
-    np.testing.assert_array_equal(Stream.start((1, 2)).returns.bounds(), (-np.inf, np.inf))
+
+
+def test_what_the_warm_up_paid_widens_no_clip():
+    """Above by the bonuses since learning began, below by what the environment paid."""
+    done, paid = jnp.array([[True, True]]), ReturnRange(jnp.float32(-0.5), jnp.float32(1.0))
+    replay = SimpleNamespace(returns=paid)
+    stream = Stream.start((1, 2)).step(jnp.array([[40.0, 30.0]]), done, learning=jnp.bool(False))
+    np.testing.assert_array_equal(stream.bounds(replay), (-0.5, np.inf))
+    stream = stream.step(jnp.array([[2.0, 3.0]]), done, learning=jnp.bool(True))
+    np.testing.assert_array_equal(stream.bounds(replay), (-0.5, 3.0))
 
 
 def test_the_null_bonus_computes_and_keeps_nothing():

@@ -256,7 +256,7 @@ def test_goal_gans_tasks_are_played_twice():
 def test_a_bonus_widens_the_clip_to_its_own_returns():
     """RIDE's scale is large: what is trained on is worth more than the environment pays, and bounds the next values."""
     states, _, _ = run(config("ride", **SWITCHES), [0, 1], hparams=[HParams(ride_scale=10.0)] * 2)
-    assert states.bonus.stream.returns.high[0] > 1.0 >= states.replay.returns.high[0]
+    assert states.bonus.stream.highest[0] > 1.0 >= states.replay.returns.high[0]
     assert states.replay.transitions.note.shape == states.replay.transitions.reward.shape
 
 

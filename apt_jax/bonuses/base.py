@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from apt_jax.config import Config, HParams
-from apt_jax.replay import Batch, Replay, ReturnRange, Transition, sample_transitions
+from apt_jax.replay import Batch, Replay, Transition, sample_transitions
 from apt_jax.specs import Obs
 from apt_jax.task_space import TaskSpace
 
@@ -72,7 +72,7 @@ class UpdateFn(Protocol):
 
 
 class ReturnRangeFn(Protocol):
-    """`return_range(state, replay) -> (low, high)`: range of episodic returns in the reward that is trained on."""
+    """`return_range(state, replay) -> (low, high)`: what next values are clipped to in the reward that is trained on."""
 
     def __call__(self, state: Any, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]: ...
 
@@ -92,20 +92,36 @@ class Bonus(NamedTuple):
 
 
 class Stream(NamedTuple):
-    """Episodic returns in the reward that is trained on, as it was when the steps were made: what the next-Q clip needs."""
+    """Episodic returns in the reward that is trained on, as it was when the steps were made: what the next-Q clip needs.
+
+    Attributes:
+      episode_return: of the current episodes, bonus included.
+      highest: of the episodes finished since learning began, -inf before the first.  What an untrained network pays during the
+        warm-up would raise it for ever.
+    """
 
     episode_return: Float[Array, "S E"]
-    returns: ReturnRange
+    highest: Float[Array, ""]
 
     @classmethod
     def start(cls, shape: tuple[int, int]) -> Stream:
         """Before the first step of S x E environments."""
-        return cls(jnp.zeros(shape), ReturnRange.empty())
+        return cls(jnp.zeros(shape), jnp.float32(-jnp.inf))
 
-    def step(self, reward: Float[Array, "S E"], done: Bool[Array, "S E"]) -> Stream:
-        """After a step that paid `reward`, bonus included."""
+    def step(self, reward: Float[Array, "S E"], done: Bool[Array, "S E"], *, learning: Bool[Array, ""]) -> Stream:
+        """After a step that paid `reward`, bonus included; `learning` says whether an episode that ends with it counts."""
         episode_return = self.episode_return + reward
-        return Stream(jnp.where(done, 0.0, episode_return), self.returns.extend(episode_return, done))
+        highest = jnp.max(episode_return, initial=-jnp.inf, where=done & learning)
+        return Stream(jnp.where(done, 0.0, episode_return), jnp.maximum(self.highest, highest))
+
+    def bounds(self, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """What the next values are clipped to: above by `highest`, unbounded before the first episode.
+
+        Below by the lowest return that the environment paid: a bonus is never negative, and a discounted value may lie below
+        every undiscounted return that has bonuses in it.
+        """
+        low, _ = replay.returns.bounds()
+        return low, jnp.where(jnp.isneginf(self.highest), jnp.inf, self.highest)
 
 
 def pay(batch: Batch, bonus: Float[Array, "..."]) -> tuple[Float[Array, "..."], Metrics]:

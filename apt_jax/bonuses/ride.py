@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from apt_jax.bonuses.base import Bonus, Metrics, Step, Steps, Stream, leading, pay, sample
 from apt_jax.bonuses.icm import losses
 from apt_jax.config import Config, HParams
-from apt_jax.descent import ADAM, adam_step
+from apt_jax.descent import ADAM, adam_step, has_learned
 from apt_jax.networks import Dynamics
 from apt_jax.networks.apply import apply
 from apt_jax.replay import Batch, Replay
@@ -22,7 +22,7 @@ from apt_jax.task_space import TaskSpace
 
 FORWARD_WEIGHT = 10.0
 INVERSE_WEIGHT = 0.1
-"""Of the two losses that the embedding learns from."""
+"""Of the two losses that the embedding learns from: the cross-entropy and half the squared error, as ICM has them."""
 
 
 class Visits(NamedTuple):
@@ -69,7 +69,8 @@ def make(space: TaskSpace, config: Config) -> Bonus:
         done, begun = step.transition.done, fingerprint(step.begun)
         visits, note = over_environments(visit)(state.visits, fingerprint(step.state), done=done, begun=begun)
         paid = step.transition.reward + bonus(state, step.transition._replace(note=note), hparams)
-        return state._replace(visits=visits, stream=state.stream.step(paid, step.transition.done)), note
+        stream = state.stream.step(paid, done, learning=has_learned(state.opt_state))
+        return state._replace(visits=visits, stream=stream), note
 
     def reward(state: RideState, batch: Batch, hparams: HParams) -> tuple[Float[Array, "..."], Metrics]:
         return pay(batch, bonus(state, batch, hparams))
@@ -92,8 +93,7 @@ def make(space: TaskSpace, config: Config) -> Bonus:
         return state._replace(params=params, opt_state=opt_state), metrics
 
     def return_range(state: RideState, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        del replay
-        return state.stream.returns.bounds()
+        return state.stream.bounds(replay)
 
     return Bonus(jax.ShapeDtypeStruct((), jnp.float32), init, annotate, reward, update, return_range)
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, Key
 from apt_jax.bonuses.base import Bonus, Metrics, Step, Steps, Stream, leading, pay, sample
 from apt_jax.bonuses.moments import Moments
 from apt_jax.config import Config, HParams
-from apt_jax.descent import ADAM, adam_step
+from apt_jax.descent import ADAM, adam_step, has_learned
 from apt_jax.networks import Distillation
 from apt_jax.networks.apply import apply
 from apt_jax.networks.encoders import Features, observation_features
@@ -47,7 +47,10 @@ class RndState(NamedTuple):
 def make(space: TaskSpace, config: Config) -> Bonus:
     """Mean squared error of the predictor, over the deviation of its filtered return, times `HParams.rnd_scale`.
 
-    Observations are normalised by what has been seen since the first, uniformly random, step.
+    Observations are normalised by what has been seen since the first, uniformly random, step.  Otherwise than in the reference,
+    one Q-function learns both rewards under the policy's discount, a termination ends both, and the predictor learns from
+    uniform draws of the replay in every round of model updates, so novelty wears off sooner: lower `bonus_learning_rate` or
+    `Config.model_updates_per_step` for more of it.
     """
     target_network = Distillation(space.obs_spec, deeper=False)
     predictor_network = Distillation(space.obs_spec, deeper=True)
@@ -83,7 +86,8 @@ def make(space: TaskSpace, config: Config) -> Bonus:
         filtered = forward_filter(state.filtered, error(state, state.predictor, step.transition.next_obs))
         state = state._replace(filtered=filtered, scale=state.scale.extend(filtered.reshape(-1)))
         paid = step.transition.reward + bonus(state, step.transition, hparams)
-        return state._replace(stream=state.stream.step(paid, step.transition.done)), ()
+        stream = state.stream.step(paid, step.transition.done, learning=has_learned(state.opt_state))
+        return state._replace(stream=stream), ()
 
     def reward(state: RndState, batch: Batch, hparams: HParams) -> tuple[Float[Array, "..."], Metrics]:
         return pay(batch, bonus(state, batch, hparams))
@@ -97,8 +101,7 @@ def make(space: TaskSpace, config: Config) -> Bonus:
         return state._replace(predictor=predictor, opt_state=opt_state), {"rnd_loss": loss}
 
     def return_range(state: RndState, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        del replay
-        return state.stream.returns.bounds()
+        return state.stream.bounds(replay)
 
     return Bonus((), init, annotate, reward, update, return_range)
 

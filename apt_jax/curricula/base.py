@@ -52,7 +52,9 @@ class RefreshFn(Protocol):
 
 
 class ReportFn(Protocol):
-    """`report(state, rollouts, hparams) -> metrics`: judge the state on fresh tasks that the behaviour policy has played."""
+    """`report(state, rollouts, hparams) -> metrics`: judge the state on fresh tasks, played by the averaged policy with
+    today's exploration (the online one collects).
+    """
 
     def __call__(self, state: Any, rollouts: Rollouts, hparams: HParams) -> Metrics: ...
 
