@@ -200,7 +200,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
     def evaluate(state: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Metrics]:
         """Greedy return on the target, the restore rule, and the curriculum judged on fresh tasks, by the averaged policy.
 
-        Draws from `key_eval` alone, so that evaluating more or less often changes nothing in training.
+        Draws from `key_eval` alone: how often it is done changes no draw of training, but how often the restore rule is asked.
         """
         key_propose, key_play, key_steps = jax.random.split(jax.random.fold_in(state.key_eval, clock.env_steps), 3)
         episodes = config.eval_episodes
@@ -334,7 +334,7 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
         f"warmup_steps must let every environment finish an episode: at least {horizon * steps}, got {config.warmup_steps}",
     )
     require(
-        not learns or (rounds >= 1 and abs(rounds - round(rounds)) < 1e-6),
+        not learns or (1 <= rounds < math.inf and abs(rounds - round(rounds)) < 1e-6),
         f"model_updates_per_step must give a whole number of updates per iteration of {steps} steps, got {rounds:g}",
     )
     require(

@@ -100,7 +100,7 @@ def step(
 
 
 def _check_like(given: Any, expected: Any, message: str) -> None:
-    """The replay would cast in silence."""
+    """Raises a ValueError where shapes or dtypes differ: the replay would cast in silence."""
     structs = [jax.tree.map(lambda x: (x.shape, x.dtype.name), tree) for tree in (given, expected)]
     if structs[0] != structs[1]:
         raise ValueError(f"{message}, {structs[1]}, got {structs[0]} (shapes with the axes of sources and environments)")

@@ -125,15 +125,25 @@ def plan(comparison: Compare, options: Sequence[str]) -> list[tuple[Experiment, 
         for method in comparison.methods:
             words = ["--target", target, "--method", method, *options]
             path = run_path(comparison, method, target)
+            parts = {part.name for part in path.glob("seeds_*")}
             if comparison.seeds_per_job is None:
+                if parts:
+                    raise UsageError(
+                        f"{path} holds runs of some seeds each; say --seeds-per-job as then, or take another --out"
+                    )
                 runs.append(_run(path, words))
                 continue
             if (path / "config.json").is_file():
                 raise UsageError(f"{path} holds a run of all its seeds; leave --seeds-per-job away, or take another --out")
             seeds = settings.parse(["--run-dir", str(path), *words])[0].seeds
-            for i in range(0, len(seeds), comparison.seeds_per_job):
-                own = [str(seed) for seed in seeds[i : i + comparison.seeds_per_job]]
-                runs.append(_run(path / f"seeds_{'_'.join(own)}", [*words, "--seeds", *own]))
+            groups = [seeds[i : i + comparison.seeds_per_job] for i in range(0, len(seeds), comparison.seeds_per_job)]
+            planned = {f"seeds_{'_'.join(map(str, own))}": own for own in groups}
+            if others := parts - set(planned):
+                raise UsageError(
+                    f"{path} holds {', '.join(sorted(others))}, of other --seeds or --seeds-per-job; "
+                    "repeat those, or take another --out"
+                )
+            runs += [_run(path / name, [*words, "--seeds", *map(str, own)]) for name, own in planned.items()]
     if comparison.ray:
         if runs[0][1].distributed:
             raise UsageError("--ray and --distributed exclude each other: a job is one process")

@@ -33,7 +33,7 @@ class Lane:
     @property
     def name(self) -> str:
         """For example "seed 3" or "seed 3, delta 0.1"."""
-        return ", ".join(f"{name} {value:g}" for name, value in self.index.items())
+        return ", ".join(f"{name} {value:.10g}" for name, value in self.index.items())  # ten digits: those of the largest seed
 
     @property
     def slug(self) -> str:

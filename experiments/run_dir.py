@@ -57,6 +57,11 @@ class RunDir:
         """Where `apt_jax.checkpoint` writes."""
         return self.path / "checkpoints"
 
+    @property
+    def has_results(self) -> bool:
+        """Whether the run came to an end, or was stopped; one that was killed has no summary."""
+        return (self.path / "summary.json").is_file()
+
     def rewind(self, env_steps: int) -> None:
         """Drops what was written after a checkpoint's step, so that a resumed run writes it once."""
         rows = [row for row in _read_rows(self.path) if int(row["env_steps"]) <= env_steps]
@@ -103,6 +108,8 @@ def _finite(content: Any) -> Any:
     match content:
         case Mapping():
             return {name: _finite(value) for name, value in content.items()}
+        case list() | tuple():
+            return [_finite(value) for value in content]
         case float() if not math.isfinite(content):
             return str(content)
         case _:
@@ -141,7 +148,7 @@ def read_settings(path: Path) -> dict[str, tuple[Int[np.ndarray, "T"], Curves]]:
     """Like `read_metrics`, the lanes of each combination of swept hyper-parameters apart, by its name ("" without a sweep)."""
     env_steps, curves = read_metrics(path)
     columns = [name for name in _lane_columns(_read_rows(path)) if name != "seed"]
-    names = [", ".join(f"{name} {curves[name][i, 0]:g}" for name in columns) for i in range(len(curves["seed"]))]
+    names = [", ".join(f"{name} {curves[name][i, 0]:.10g}" for name in columns) for i in range(len(curves["seed"]))]
     lanes = {name: [i for i, other in enumerate(names) if other == name] for name in dict.fromkeys(names)}
     return {name: (env_steps, {metric: values[own] for metric, values in curves.items()}) for name, own in lanes.items()}
 

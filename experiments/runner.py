@@ -32,7 +32,7 @@ class Runner:
     """Holds the states of L lanes and the compiled functions that change them; processes call its methods together.
 
     Raises:
-      UsageError: fewer lanes than processes.
+      UsageError: fewer lanes than processes, or more than there is room for where they cannot take turns (`make_program`).
     """
 
     def __init__(self, trainer: Trainer, experiment: Experiment, layout: Layout, at_once: int | None = None):

@@ -123,6 +123,8 @@ class _Basis:
     resume: bool = False
     preset: Preset | None = None
     space: str = Experiment.space
+    target: str | None = None
+    target_file: Path | None = None
 
 
 def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
@@ -154,8 +156,9 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
     experiment, session = tyro.cli(train, args=args, prog="python -m experiments.train", config=(tyro.conf.FlagCreatePairsOff,))
     if session.method:
         experiment = dataclasses.replace(experiment, config=dataclasses.replace(experiment.config, method=session.method))
-    if not experiment.target_file:
-        experiment = dataclasses.replace(experiment, target_file=target_path(experiment.space, experiment.target))
+    if not experiment.target_file or (saved and basis.target and not basis.target_file):
+        file = target_path(experiment.space, experiment.target)  # named again, it may not be what the run has kept of it
+        experiment = dataclasses.replace(experiment, target_file=file or experiment.target_file)
     check(experiment, session)
     if saved:
         check_resumable(saved, experiment)
@@ -257,13 +260,21 @@ def target_name(experiment: Experiment) -> str:
     return experiment.target_file.name if experiment.target_file else experiment.target
 
 
+def _read(file: Path) -> str:
+    """The text of a file; raises a `UsageError` where there is none."""
+    try:
+        return file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{file} cannot be read as text: {error}") from error
+
+
 def _comparable(experiment: Experiment) -> dict[str, Any]:
     """Every field under its option's name, the target file by its content; without `env_steps`."""
     fields = dataclasses.asdict(experiment)
     del fields["env_steps"]
     config, hparams = fields.pop("config"), fields.pop("hparams")
     if experiment.target_file:
-        fields["target_file"] = experiment.target_file.read_text()
+        fields["target_file"] = _read(experiment.target_file)
     return {
         **fields,
         **{f"config.{name}": value for name, value in config.items()},

@@ -15,7 +15,7 @@ from typing import TypeVar
 
 from apt_jax import checkpoint
 from experiments import pictures, processes, run_dir, runtime
-from experiments.errors import exit_with
+from experiments.errors import UsageError, exit_with
 from experiments.interrupt import EXIT_CODE, Interrupt
 from experiments.problem import make_problem
 from experiments.progress import Metrics, View, make_view
@@ -53,11 +53,11 @@ def train(experiment: Experiment, session: Session) -> int:
     processes.check_same(repr((experiment, dataclasses.replace(session, process_id=None))))
     runner = Runner(problem.trainer, experiment, session.layout, session.at_once)
     run = RunDir(session.run_dir)
-    start = processes.from_first(lambda: open_run(experiment, session))
-    if processes.from_first(lambda: is_complete(run.path, experiment)):
+    if session.resume and processes.from_first(lambda: is_complete(run.path, experiment)):
         if processes.is_first():
             print(f"{run.path} has all its {experiment.env_steps:,} steps; pass a larger --env-steps to go on")
         return 0
+    start = processes.from_first(lambda: open_run(experiment, session))
     names = [lane.name for lane in experiment.lanes]
     with (
         Interrupt() as interrupt,
@@ -80,7 +80,7 @@ def train(experiment: Experiment, session: Session) -> int:
             view.note(f"stopped at {runner.env_steps:,} steps; to go on: {session.resume_command}")
             return EXIT_CODE
         view.note(f"finished {runner.env_steps:,} steps after {times.wall:.0f} s: {run.path}")
-        return 0
+        return EXIT_CODE if processes.any_of(interrupt.requested) else 0  # asked to stop too late for this run, not for a next
 
 
 def open_sinks(experiment: Experiment, session: Session, start: int) -> list[Sink]:
@@ -90,13 +90,19 @@ def open_sinks(experiment: Experiment, session: Session, start: int) -> list[Sin
 
 
 def open_run(experiment: Experiment, session: Session) -> int:
-    """Makes a new run directory, or the one to resume as it was at its checkpoint; returns that one's steps, 0 without any."""
+    """Makes a new run directory, or the one to resume as it was at its checkpoint; returns that one's steps, 0 without any.
+
+    Raises:
+      UsageError: a new one holds something already, or one to resume has results but its checkpoint is gone.
+    """
     config = dataclasses.asdict(experiment)
     if not session.resume:
         RunDir.create(session.run_dir, config, experiment.target_file)
         return 0
     run = RunDir(session.run_dir)
     start = checkpoint.latest_step(run.checkpoints) or 0
+    if not start and run.has_results:
+        raise UsageError(f"{run.path} has results, but no checkpoint to go on from (checkpoints/); take another --run-dir")
     run.rewind(start)
     run.write_json("config.json", {**config, "target_file": run_dir.read_config(run.path)["target_file"]})
     return start

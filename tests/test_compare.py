@@ -47,6 +47,12 @@ def test_seeds_are_split_over_jobs_and_put_together_again(tmp_path):
     parts = compare.run_parts(comparison, "dqn", "A")
     curves = report.read_parts("dqn", parts)["dqn"][1]
     np.testing.assert_array_equal(curves["target_return"], [[4], [2], [9]])
+    more = compare.plan(comparison, ["--preset", "fast", "--seeds", "4", "2", "9", "--env-steps", "200000"])
+    assert [session.resume for _, session in more] == [True, True]
+    with pytest.raises(UsageError, match=r"holds seeds_9, of other --seeds or --seeds-per-job"):
+        compare.plan(comparison, ["--preset", "fast", "--seeds", "4", "2", "9", "5"])
+    with pytest.raises(UsageError, match="runs of some seeds each; say --seeds-per-job"):
+        compare.plan(dataclasses.replace(comparison, seeds_per_job=None), ["--preset", "fast", "--seeds", "4", "2", "9"])
     with pytest.raises(UsageError, match="not the seeds of one run"):
         report.read_parts("dqn", [*parts, parts[0]])
 

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh
 
-from experiments import compare, settings
+import envs
+from experiments import compare, pictures, settings
 from experiments.compare import Compare
 from experiments.problem import make_problem
 from experiments.run_dir import RunDir
@@ -108,6 +109,16 @@ def test_two_processes_train_as_one_and_one_goes_on_for_both(tmp_path, start, wh
         process.communicate()
     assert process.returncode == 0
     assert_same_run(run, whole)
+
+
+def test_an_interrupt_during_the_last_pictures_stops_what_would_come_next(tmp_path, monkeypatch):
+    monkeypatch.setitem(envs.SPACES, "corridor", corridor_runs.Space)
+    monkeypatch.setattr(pictures, "draw", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+    comparison = Compare(tmp_path, methods=("dqn", "random"), targets=("far",))
+    runs = compare.plan(comparison, [*OPTIONS, "--seeds", "0", "--env-steps", "60"])
+    assert compare.make_in_turn(runs) == 130
+    assert (tmp_path / "far" / "dqn" / "summary.json").exists()
+    assert not (tmp_path / "far" / "random").exists()
 
 
 def test_a_seed_is_the_same_on_eight_devices(tmp_path, start, whole):

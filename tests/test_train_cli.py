@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import math
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -69,6 +71,7 @@ def start_run(path: Path, *options: str) -> Experiment:
         ("--plugins experiments.laddr", "--plugins experiments.laddr: No module named 'experiments.laddr'"),
         ("--target a", "closest is 'A'"),
         ("--method apt-gen", "closest is 'apt_gen'"),
+        ("--config.model-updates-per-step inf", "whole number of updates per iteration"),
         ("--config.batch-size 5", "batch_size must be a positive multiple"),
         ("--resume", "holds no run"),
     ],
@@ -192,6 +195,35 @@ def test_a_run_keeps_its_target_file(tmp_path):
         settings.parse([*resume, "--target-file", str(file)])
 
 
+def test_a_target_file_named_again_is_the_one_that_the_run_has_kept(tmp_path):
+    file = tmp_path / "mine.txt"
+    file.write_text("first")
+    start_run(tmp_path / "run", "--target", str(file))
+    resume = ["--run-dir", str(tmp_path / "run"), "--resume", "--target", str(file)]
+    assert settings.parse(resume)[0].target == str(file)
+    file.write_text("second")
+    with pytest.raises(UsageError, match=r"target_file \(saved first, asked second\)"):
+        settings.parse(resume)
+    file.unlink()
+    assert settings.parse(resume)[0].target_file == tmp_path / "run" / "target.txt"
+    (tmp_path / "run" / "target.txt").unlink()
+    with pytest.raises(UsageError, match=r"target.txt is no file"):
+        settings.parse(resume)
+
+
+def test_infinite_values_of_a_sweep_are_saved_and_read(tmp_path):
+    experiment = start_run(tmp_path / "run", "--hparams.spectral-bound", "0.8", "inf")
+    assert settings.load(tmp_path / "run") == experiment
+    assert experiment.hparams.spectral_bound == (0.8, math.inf)
+
+
+def test_lanes_of_large_seeds_have_names_of_their_own():
+    names = [lane.name for lane in Experiment(seeds=(20240101, 20240102, 2**31 - 1), hparams=HParams(delta=(0.1, 3e-4))).lanes]
+    assert len(set(names)) == 6
+    assert names[0] == "seed 20240101, delta 0.1"
+    assert names[-1] == "seed 2147483647, delta 0.0003"
+
+
 def test_the_resume_command_repeats_how_not_what(tmp_path):
     session = Session(Path("my run"), devices=1, sinks=("tensorboard",), method="random")
     assert session.resume_command == ("python -m experiments.train --run-dir 'my run' --resume --devices 1 --sinks tensorboard")
@@ -276,6 +308,14 @@ def test_an_interrupted_run_says_how_to_go_on_and_ends_complete(tmp_path, capsys
     evaluate.evaluate(evaluate.Args(run, target="B", episodes=2, gif=tmp_path / "film.gif"))
     assert "B after 1,200 steps" in capsys.readouterr().out
     assert (tmp_path / "film.gif").exists()
+
+    kept = (run / "metrics.csv").read_bytes()
+    shutil.rmtree(run / "checkpoints")
+    assert train.train(*settings.parse(["--run-dir", str(run), "--resume"])) == 0
+    with pytest.raises(UsageError, match="has results, but no checkpoint to go on from"):
+        train.train(*settings.parse(["--run-dir", str(run), "--resume", "--env-steps", "1300"]))
+    assert (run / "metrics.csv").read_bytes() == kept
+    assert len(run_dir.task_files(run)) > 0
 
 
 def rows(path: Path) -> list[tuple[int, int]]:
