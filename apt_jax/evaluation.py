@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from apt_jax import draws
 from apt_jax.replay import Rollouts, Transition
 from apt_jax.specs import Obs, Params
 from apt_jax.task_space import TaskSpace
@@ -67,7 +68,7 @@ def play(space: TaskSpace, tasks: Any, policy: Policy, key: Key[Array, ""]) -> t
 def sample_rollouts(w: Params, outcome: Outcome, transitions: Transition, key: Key[Array, ""], *, steps: int) -> Rollouts:
     """What `play` returned for tasks `w`, with `steps` transitions of each drawn with replacement; consumes `key`."""
     n = outcome.length.shape[0]
-    at = jax.random.randint(key, (n, steps), 0, outcome.length[:, None])
+    at = draws.integers(key, (n, steps), outcome.length[:, None])
     return Rollouts(
         w=w,
         initial_obs=jax.tree.map(lambda x: x[:, 0], transitions.obs),

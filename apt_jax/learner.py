@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from apt_jax import draws
 from apt_jax.config import HParams
 from apt_jax.descent import ADAM, adam_step
 from apt_jax.losses import td_errors, td_target
@@ -57,9 +58,8 @@ def epsilon_greedy(
 ) -> Int[Array, "..."]:
     """Greedy actions, each replaced by a uniform one with probability `epsilon`, one for all or one each; consumes `key`."""
     action = greedy(network, params, obs)
-    key_explore, key_action = jax.random.split(key)
-    explore = jax.random.uniform(key_explore, action.shape) < epsilon
-    return jnp.where(explore, jax.random.randint(key_action, action.shape, 0, network.num_actions), action)
+    chance, choice = draws.uniform(key, (2, *action.shape))
+    return jnp.where(chance < epsilon, jnp.floor(choice * network.num_actions).astype(action.dtype), action)
 
 
 def epsilon_schedule(steps: Int[Array, ""], hparams: HParams) -> Float[Array, ""]:

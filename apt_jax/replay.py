@@ -9,12 +9,14 @@ Axes: S sources, E environments per source, T columns, N episode slots.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from apt_jax import draws
 from apt_jax.specs import Obs, Params, Spec, obs_struct, param_struct, zeros_like
 
 
@@ -188,12 +190,12 @@ def sample_transitions(
     """
     sources, envs, columns = replay.transitions.action.shape
     share = batch_size // sources
-    key_step, key_success = jax.random.split(key)
+    key_step, *keys_success = jax.random.split(key, 3)
     env, first = _draw_steps(replay, key_step, iteration, (sources, batches, share))
     from_successes = round(success_share * share)
     if from_successes:
         kept, replaced = ((env[..., part], first[..., part]) for part in (slice(from_successes, None), slice(from_successes)))
-        drawn = _draw_successes(replay, key_success, iteration, horizon, otherwise=replaced)
+        drawn = _draw_successes(replay, keys_success, iteration, horizon, otherwise=replaced)
         env, first = (jnp.concatenate(parts, axis=-1) for parts in zip(drawn, kept, strict=True))
     row = (jnp.arange(sources, dtype=jnp.int32)[:, None, None] * envs + env) * columns
 
@@ -228,27 +230,25 @@ Positions = tuple[Int[Array, "S batches n"], Int[Array, "S batches n"]]
 def _draw_steps(replay: Replay, key: Key[Array, ""], iteration: Int[Array, ""], shape: tuple[int, int, int]) -> Positions:
     """Steps drawn uniformly from the ring; consumes `key`."""
     _, envs, columns = replay.transitions.action.shape
-    key_env, key_age = jax.random.split(key)
-    env = jax.random.randint(key_env, shape, 0, envs)
-    age = jax.random.randint(key_age, shape, 0, jnp.minimum(iteration + 1, columns))
+    age, env = jnp.divmod(draws.integers(key, shape, envs * jnp.minimum(iteration + 1, columns)), envs)
     return env, iteration - age
 
 
 def _draw_successes(
-    replay: Replay, key: Key[Array, ""], iteration: Int[Array, ""], horizon: int, *, otherwise: Positions
+    replay: Replay, keys: Sequence[Key[Array, ""]], iteration: Int[Array, ""], horizon: int, *, otherwise: Positions
 ) -> Positions:
-    """Successful episodes drawn uniformly, and of each a step drawn uniformly, where a source has any; consumes `key`."""
+    """Successful episodes drawn uniformly, and of each a step drawn uniformly, where a source has any; consumes both `keys`."""
     columns = replay.transitions.action.shape[2]
-    key_episode, key_step = jax.random.split(key)
+    key_episode, key_step = keys
     shape = otherwise[0].shape
     # The first steps of an episode that ended longer ago may be overwritten.
     whole = replay.episodes.end > iteration - columns + horizon
     counted = jnp.cumsum(whole & replay.episodes.success, axis=1, dtype=jnp.int32)
     count = counted[:, -1][:, None, None]
-    rank = 1 + jax.random.randint(key_episode, shape, 0, jnp.maximum(count, 1))
+    rank = 1 + draws.integers(key_episode, shape, jnp.maximum(count, 1))
     slot = jax.vmap(jnp.searchsorted)(counted, rank)
     source = jnp.arange(shape[0], dtype=jnp.int32)[:, None, None]
-    age = jax.random.randint(key_step, shape, 0, replay.episodes.length[source, slot])
+    age = draws.integers(key_step, shape, replay.episodes.length[source, slot])
     drawn = replay.episodes.env[source, slot], replay.episodes.end[source, slot] - age
     env, first = (jnp.where(count > 0, new, old) for new, old in zip(drawn, otherwise, strict=True))
     return env, first
@@ -259,7 +259,7 @@ def sample_rollouts(
     key: Key[Array, ""],
     iteration: Int[Array, ""],
     *,
-    source: int,
+    source: Int[Array, ""] | int,
     batch_size: int,
     steps: int,
     recent: int,
@@ -282,7 +282,7 @@ def sample_rollouts(
     slot = (replay.finished[source] - 1 - back) % slots
     picked = jax.tree.map(lambda ring: ring[source, slot], replay.episodes)
     start = picked.end - picked.length + 1
-    offset = jax.random.randint(key_step, (batch_size, steps), 0, picked.length[:, None])
+    offset = draws.integers(key_step, (batch_size, steps), picked.length[:, None])
 
     def gather(ring: Array, at: Int[Array, "..."]) -> Array:
         env = picked.env.reshape(batch_size, *(1,) * (at.ndim - 1))
@@ -321,11 +321,6 @@ def recent_outcome(replay: Replay, *, source: int, window: int, since: int = 0) 
     began = replay.episodes.end[source, slot] - replay.episodes.length[source, slot] + 1
     valid = (back < count) & (began >= since)
 
-    def mean(values: Array) -> Array:
-        return jnp.mean(values[source, slot].astype(jnp.float32), where=valid)
-
-    return {
-        "episode_return": mean(replay.episodes.episode_return),
-        "success": mean(replay.episodes.success),
-        "length": mean(replay.episodes.length),
-    }
+    names = ("episode_return", "success", "length")
+    outcomes = jnp.stack([getattr(replay.episodes, name)[source, slot].astype(jnp.float32) for name in names])
+    return dict(zip(names, jnp.mean(outcomes, axis=1, where=valid), strict=True))

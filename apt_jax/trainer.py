@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import evaluation, learner, replay, workers
@@ -26,6 +27,8 @@ from apt_jax.methods import make_method
 from apt_jax.networks import QNetwork
 from apt_jax.specs import Grid, Obs, Params, Spec, Table, Vector, obs_struct, param_struct
 from apt_jax.task_space import TaskSpace
+
+Carry = TypeVar("Carry")
 
 _REFRESH_STREAM = 1_000_033
 """Refreshing draws from a stream of its own, so that curricula which draw nothing there change nothing elsewhere."""
@@ -85,9 +88,11 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
     """The trainer of a configuration for one target task of `space`.
 
     Raises:
-      ValueError: an unknown method, sizes that do not fit together (what, and what is allowed), or a space or target that
-        is not what its specs say.
+      ValueError: an unknown method, sizes that do not fit together (what, and what is allowed), a space or target that
+        is not what its specs say, or JAX set to 64 bits.
     """
+    if jax.dtypes.canonicalize_dtype(float) != jnp.float32:
+        raise ValueError("apt_jax computes with 32 bits: unset jax_enable_x64 (JAX_ENABLE_X64)")
     check_counts(config)
     check_space(space)
     check_target(space, target)
@@ -163,8 +168,8 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         def update(carry: learner.LearnerState, batch: replay.Batch) -> tuple[learner.LearnerState, Metrics]:
             return learner.update(network, carry, batch, low=low, high=high, hparams=hparams)
 
-        learner_state, metrics = jax.lax.scan(update, state.learner, batches._replace(reward=reward))
-        return state._replace(learner=learner_state), {**_mean(metrics), **bonus_metrics}
+        learner_state, metrics = _scan(update, state.learner, batches._replace(reward=reward))
+        return state._replace(learner=learner_state), {**metrics, **bonus_metrics}
 
     def adapt(state: TrainState, clock: Clock, key: Key[Array, ""], hparams: HParams) -> tuple[TrainState, Metrics]:
         def update(carry: tuple[Any, Any, Key[Array, ""]], _: None) -> tuple[tuple[Any, Any, Key[Array, ""]], Metrics]:
@@ -177,8 +182,8 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             return (curriculum_state, bonus_state, key), {**metrics, **bonus_metrics}
 
         rounds = round(config.model_updates_per_step * steps) if learns else 0
-        (curriculum_state, bonus_state, _), metrics = jax.lax.scan(update, (state.curriculum, state.bonus, key), length=rounds)
-        return state._replace(curriculum=curriculum_state, bonus=bonus_state), _mean(metrics)
+        (curriculum_state, bonus_state, _), metrics = _scan(update, (state.curriculum, state.bonus, key), length=rounds)
+        return state._replace(curriculum=curriculum_state, bonus=bonus_state), metrics
 
     def iteration(carry: tuple[TrainState, Clock], hparams: HParams) -> tuple[tuple[TrainState, Clock], Metrics]:
         state, clock = carry
@@ -242,16 +247,14 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
 
     def chunk(state: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock, Metrics]:
         def refresh_period(carry: tuple[TrainState, Clock], _: None) -> tuple[tuple[TrainState, Clock], Metrics]:
-            (state, clock), metrics = jax.lax.scan(
-                lambda c, _: iteration(c, hparams), carry, length=config.refresh_every // steps
-            )
+            (state, clock), metrics = _scan(lambda c, _: iteration(c, hparams), carry, length=config.refresh_every // steps)
             key_refresh = jax.random.fold_in(state.key, _REFRESH_STREAM)
             refreshed = curriculum.refresh(state.curriculum, key_refresh, state.replay, clock.iteration, hparams)
-            return (state._replace(curriculum=refreshed), clock), _mean(metrics)
+            return (state._replace(curriculum=refreshed), clock), metrics
 
-        (state, clock), metrics = jax.lax.scan(refresh_period, (state, clock), length=config.eval_every // config.refresh_every)
+        (state, clock), metrics = _scan(refresh_period, (state, clock), length=config.eval_every // config.refresh_every)
         state, eval_metrics = evaluate(state, clock, hparams)
-        return state, clock, {**_mean(metrics), **eval_metrics}
+        return state, clock, {**metrics, **eval_metrics}
 
     def propose(state: TrainState, key: Key[Array, ""], n: int, hparams: HParams) -> Params:
         return curriculum.propose(state.curriculum, key, n, hparams)
@@ -426,6 +429,18 @@ def _sources(rings: replay.Replay, window: int, since: int) -> Metrics:
     }
 
 
-def _mean(metrics: Metrics) -> Metrics:
-    """Mean over the leading axis of a scan."""
-    return jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics)
+def _scan(
+    step: Callable[[Carry, Any], tuple[Carry, Metrics]], carry: Carry, xs: Any = None, *, length: int | None = None
+) -> tuple[Carry, Metrics]:
+    """`jax.lax.scan` of a step that yields scalar metrics, with their means; kept as one array, they compile sooner."""
+    as_metrics = None
+
+    def packed(carry: Carry, x: Any) -> tuple[Carry, Float[Array, "metrics"]]:
+        nonlocal as_metrics
+        carry, metrics = step(carry, x)
+        flat, as_metrics = ravel_pytree(metrics)
+        return carry, flat
+
+    carry, values = jax.lax.scan(packed, carry, xs, length=length)
+    assert as_metrics is not None, "a scan traces its step, also if it makes none"
+    return carry, as_metrics(jnp.mean(values, axis=0))

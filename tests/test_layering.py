@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset({"descent", "registry", "specs"}),
+    frozenset({"descent", "draws", "registry", "specs"}),
     frozenset({"config", "task_space"}),
     frozenset({"losses", "networks", "replay"}),
     frozenset({"bonuses", "curricula", "learner"}),
@@ -25,7 +25,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"checkpoint", "lanes"}),
     frozenset({"__init__"}),  # the package's own face
 )
-ENVS_MAY_IMPORT = frozenset({"registry", "specs", "task_space"})
+ENVS_MAY_IMPORT = frozenset({"draws", "registry", "specs", "task_space"})
 OURS = frozenset({"apt_jax", "envs", "experiments"})
 
 

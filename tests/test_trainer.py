@@ -42,13 +42,17 @@ CONFIG = Config(
     alp_fit_every=20,
     goal_tasks=8,
 )
+EVERYTHING = "apt_gen+rnd"
+"""A curriculum that learns and a bonus that does: the method of tests that any would do for, which share its programs."""
+
 PAPER, FAST = (dataclasses.asdict(PRESETS[preset][0]) for preset in ("paper", "fast"))
 SWITCHES = {name: FAST[name] for name in FAST if FAST[name] != PAPER[name] == getattr(CONFIG, name)}
 """What preset "fast" does otherwise than the paper, beyond the sizes that are made small here."""
 
 
 def config(method: str, **changes) -> Config:
-    return dataclasses.replace(CONFIG, method=method, **changes)
+    """A small configuration with everything switched on that preset "fast" does."""
+    return dataclasses.replace(CONFIG, method=method, **SWITCHES | changes)
 
 
 @functools.cache
@@ -90,7 +94,7 @@ def test_every_preset_makes_a_trainer(preset):
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_makes_a_program(method):
     """Traced, not compiled: shapes and dtypes fit, and the state keeps its structure."""
-    trainer = make_trainer(SPACE, TARGET, config(method, **SWITCHES))
+    trainer = make_trainer(SPACE, TARGET, config(method))
     state = jax.eval_shape(trainer.init, jax.random.key(0), jax.tree.map(jnp.float32, HParams()))
     after, _, metrics = jax.eval_shape(trainer.chunk, state, Clock.start(), jax.tree.map(jnp.float32, HParams()))
     assert after == state
@@ -109,16 +113,16 @@ def test_the_averaged_policy_is_judged():
     assert np.all(metrics["target_return_raw"] > 0.5)
 
 
-@pytest.mark.parametrize("method", ["apt_gen+rnd", "random", "dqn", "alp_gmm", "goal_gan", "ride"])
+@pytest.mark.parametrize("method", [EVERYTHING, "random", "dqn", "alp_gmm", "goal_gan", "ride"])
 def test_metrics_are_finite_and_the_clock_counts_every_source(method):
-    """With everything switched on; the other tests run the paper's form."""
     _, hparams = PRESETS["fast"]
-    _, clock, history = run(config(method, **SWITCHES), [0, 1], hparams=[hparams] * 2)
+    lanes = 5 if method == EVERYTHING else 2
+    _, clock, history = run(config(method), range(lanes), hparams=[hparams] * lanes)
     assert clock.env_steps == 180
     assert clock.iteration == (90 if parse_method(method).curriculum == "none" else 45)
     for metrics in history:
         for name, value in metrics.items():
-            assert value.shape == (2,), name
+            assert value.shape == (lanes + lanes % 2,), name  # two devices
             # Nothing is known of a source until an episode that began after the warm-up is over.
             assert np.isfinite(value).all() or name.startswith(("behaviour_", "generated_")), name
 
@@ -153,6 +157,11 @@ def lane_struct(trainer):
     return jax.eval_shape(make_program(trainer, 1).init, keys, lanes), Clock.start(), lanes
 
 
+def test_64_bits_are_refused():
+    with jax.enable_x64(True), pytest.raises(ValueError, match="computes with 32 bits: unset jax_enable_x64"):
+        make_trainer(SPACE, TARGET, CONFIG)
+
+
 def test_hparams_out_of_range_are_refused():
     with pytest.raises(ValueError, match=r"gamma must be in \[0, 1\], got 1.5"):
         stack_hparams([HParams(), HParams(gamma=1.5)])
@@ -182,7 +191,7 @@ def test_diversity_sees_a_collapse_of_one_modality():
 @pytest.mark.parametrize("layout", ["map", "vmap"])
 def test_a_seed_alone_equals_the_same_seed_among_others(layout):
     """Float reassociation is the only difference allowed; on two devices five lanes also exercise the padding."""
-    cfg, seeds = config("apt_gen", **SWITCHES), [3, 4, 5, 6, 7]
+    cfg, seeds = config(EVERYTHING), [3, 4, 5, 6, 7]
     several, _, history = run(cfg, seeds, layout=layout)
     # Metrics stay on the devices of their lanes: to bring them together, devices would have to wait for each other.
     assert all(value.sharding.spec == PartitionSpec("lane") for value in history[0].values())
@@ -194,8 +203,8 @@ def test_a_seed_alone_equals_the_same_seed_among_others(layout):
 @pytest.mark.parametrize("method", ["alp_gmm", "goal_gan", "ride"])
 def test_a_seed_of_another_method_is_the_same_beside_any_other(method):
     _, hparams = PRESETS["fast"]
-    first, _, _ = run(config(method, **SWITCHES), [0, 1], hparams=[hparams] * 2)
-    second, _, _ = run(config(method, **SWITCHES), [1, 2], hparams=[hparams] * 2)
+    first, _, _ = run(config(method), [0, 1], hparams=[hparams] * 2)
+    second, _, _ = run(config(method), [1, 2], hparams=[hparams] * 2)
     assert_lane_equal(first, 1, jax.tree.map(lambda x: x[:1], second))
 
 
@@ -243,7 +252,7 @@ def test_a_method_is_a_curriculum_and_a_bonus():
 
 def test_goal_gans_tasks_are_played_twice():
     """Consecutive episodes of an environment share their task, and then it changes."""
-    states, _, _ = run(config("goal_gan", **SWITCHES), [0, 1])
+    states, _, _ = run(config("goal_gan"), [0, 1], chunks=4)
     count = int(states.replay.finished[0, 1])
     episodes = jax.tree.map(lambda x: np.asarray(x[0, 1, :count]), states.replay.episodes)
     for env in range(2):
@@ -255,13 +264,13 @@ def test_goal_gans_tasks_are_played_twice():
 
 def test_a_bonus_widens_the_clip_to_its_own_returns():
     """RIDE's scale is large: what is trained on is worth more than the environment pays, and bounds the next values."""
-    states, _, _ = run(config("ride", **SWITCHES), [0, 1], hparams=[HParams(ride_scale=10.0)] * 2)
+    states, _, _ = run(config("ride"), [0, 1], hparams=[HParams(ride_scale=10.0)] * 2)
     assert states.bonus.stream.highest[0] > 1.0 >= states.replay.returns.high[0]
     assert states.replay.transitions.note.shape == states.replay.transitions.reward.shape
 
 
 def test_hyper_parameter_lanes_equal_separate_runs():
-    cfg = config("apt_gen", **SWITCHES)
+    cfg = config(EVERYTHING)
     lanes = [HParams(delta=delta, gamma=gamma) for delta, gamma in ((0.1, 0.9), (0.9, 0.5), (0.1, 0.5), (0.5, 0.9), (0.9, 0.0))]
     several, _, _ = run(cfg, [1] * 5, hparams=lanes, layout="vmap")
     for lane, hparams in enumerate(lanes):
@@ -277,11 +286,11 @@ def test_seeds_differ():
     assert all(not np.array_equal(k[0], k[1]) for k in kernels)
 
 
-@pytest.mark.parametrize("method", ["apt_gen", "alp_gmm", "goal_gan", "ride"])
+@pytest.mark.parametrize("method", [EVERYTHING, "alp_gmm", "goal_gan", "ride"])
 def test_nothing_compiles_after_the_first_chunk(method):
     """Neither in a longer run, nor for other seeds or hyper-parameters."""
-    cfg = config(method, **SWITCHES)
-    lanes = 5 if method == "apt_gen" else 2  # programs of other tests
+    cfg = config(method)
+    lanes = 5 if method == EVERYTHING else 2  # programs of other tests
     run(cfg, range(lanes), chunks=1)
     compiled = []
     jax.monitoring.register_event_duration_secs_listener(
@@ -328,10 +337,10 @@ def test_the_final_observation_is_stored_not_the_reset_one():
 
 @pytest.mark.parametrize("method", ["apt_gen", "random", "dqn"])
 def test_methods_learn_a_shorter_corridor(method):
-    """Five tiles away: the shortest way pays 0.96, and nothing else more than 0.94."""
-    cfg = config(
-        method, warmup_steps=400, updates_per_step=2, batch_size=64, replay_steps=2000, refresh_every=100, eval_every=400
-    )
+    """The paper's form, five tiles away: the shortest way pays 0.96, and nothing else more than 0.94."""
+    paper = {name: PAPER[name] for name in SWITCHES}
+    sizes = {"warmup_steps": 400, "updates_per_step": 2, "batch_size": 64, "replay_steps": 2000}
+    cfg = config(method, **paper, **sizes, refresh_every=100, eval_every=400)
     compiled = make_program(make_trainer(SPACE, np.int32(5), cfg), 2)
     lanes = stack_hparams([HParams(learning_rate=1e-3, epsilon_steps=400.0)] * 2)
     states = compiled.init(jax.vmap(jax.random.key)(np.arange(2)), lanes)
@@ -344,15 +353,15 @@ def test_methods_learn_a_shorter_corridor(method):
 @pytest.mark.parametrize("stop", [0, 1, 2])
 def test_resuming_from_a_checkpoint_equals_never_having_stopped(tmp_path, stop):
     """Bit for bit, in every leaf of the state, whichever chunk was the last before the stop."""
-    cfg = config("apt_gen", **SWITCHES)
-    straight, straight_clock, _ = run(cfg, [0, 1], chunks=3)
-    states, clock, _ = run(cfg, [0, 1], chunks=stop)
+    cfg, seeds = config(EVERYTHING), range(5)
+    straight, straight_clock, _ = run(cfg, seeds, chunks=3)
+    states, clock, _ = run(cfg, seeds, chunks=stop)
     checkpoint.save(tmp_path, int(clock.env_steps), (states, clock))
     template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), (states, clock))
-    lanes = stack_hparams([HParams()] * 2)
+    lanes = stack_hparams([HParams()] * 5)
     states, clock = checkpoint.restore(tmp_path, template)
     for _ in range(3 - stop):
-        states, clock, _ = program(cfg, 2, "map").chunk(states, clock, lanes)
+        states, clock, _ = program(cfg, 5, "map").chunk(states, clock, lanes)
     for a, b in zip(leaves((states, clock)), leaves((straight, straight_clock)), strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
+from apt_jax import draws
 from apt_jax import replay as rp
 from apt_jax.config import BetaRule, Config, HParams
 from apt_jax.curricula.apt_gen_objectives import make_objectives, task_progress
@@ -62,19 +63,23 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
     def noise(key: Key[Array, ""], n: int) -> Float[Array, "n z"]:
         return jax.random.normal(key, (n, config.noise_size))
 
-    def init_ensemble(key: Key[Array, ""]) -> Any:
+    def init_ensembles(key: Key[Array, ""]) -> tuple[Any, Any]:
+        """Of V1 and of V2, initialised together: that compiles sooner."""
         w = zeros_like(param_struct(space.param_spec))
-        return jax.vmap(lambda key: networks.value.init(key, w))(jax.random.split(key, config.value_ensemble))
+        values = jax.vmap(lambda key: networks.value.init(key, w))(jax.random.split(key, 2 * config.value_ensemble))
+        half = config.value_ensemble
+        return jax.tree.map(lambda x: x[:half], values), jax.tree.map(lambda x: x[half:], values)
 
     def init(key: Key[Array, ""], hparams: HParams) -> AptGenState:
-        key_g, key_d, key_1, key_2, key_spectral, key_stats = jax.random.split(key, 6)
+        key_g, key_d, key_v, key_spectral, key_stats = jax.random.split(key, 5)
         variables = networks.generator.init(key_g, jnp.zeros((2, config.noise_size)), train=True)
         obs = zeros_like(obs_struct(space.obs_spec))
+        progress_value, return_value = init_ensembles(key_v)
         models = Models(
             generator=variables["params"],
             discriminator=networks.discriminator.init(key_d, obs, jnp.int32(0), reward=jnp.float32(0.0), next_obs=obs),
-            progress_value=init_ensemble(key_1),
-            return_value=init_ensemble(key_2),
+            progress_value=progress_value,
+            return_value=return_value,
         )
 
         # The first tasks are drawn from running statistics, which must describe the fresh generator before it is used.
@@ -100,9 +105,9 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
     def update(
         state: AptGenState, key: Key[Array, ""], replay: rp.Replay, iteration: Int[Array, ""], hparams: HParams
     ) -> tuple[AptGenState, Metrics]:
-        key_target, key_generated, key_z = jax.random.split(key, 3)
+        key_z, key_sample = jax.random.split(key)
 
-        def sample(key: Key[Array, ""], source: int, recency: Float[Array, ""] | float) -> rp.Rollouts:
+        def sample(key: Key[Array, ""], source: Int[Array, ""], recency: Float[Array, ""]) -> rp.Rollouts:
             return rp.sample_rollouts(
                 replay,
                 key,
@@ -114,7 +119,9 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
                 recency=recency,
             )
 
-        target, generated = sample(key_target, TARGET, 1.0), sample(key_generated, GENERATED, hparams.recency)
+        sources = jnp.array([TARGET, GENERATED], jnp.int32)
+        rollouts = jax.vmap(sample)(jax.random.split(key_sample), sources, jnp.stack([1.0, hparams.recency]))
+        target, generated = (jax.tree.map(lambda x, source=source: x[source], rollouts) for source in (0, 1))
         z = noise(key_z, batch)
 
         def loss(models: Models) -> tuple[Float[Array, ""], tuple[Any, Any, Metrics]]:
@@ -201,15 +208,13 @@ def explore(spec: Spec, w: Params, key: Key[Array, ""], hparams: HParams) -> Par
     explored = {}
     for (name, modality), key_block in zip(spec.items(), jax.random.split(key, len(spec)), strict=True):
         block = w[name]
-        key_noise, key_cell = jax.random.split(key_block)
         if isinstance(modality, Vector):
             spread = hparams.vector_noise * (modality.high - modality.low)
-            noisy = block + spread * jax.random.normal(key_noise, block.shape)
+            noisy = block + spread * jax.random.normal(key_block, block.shape)
             explored[name] = jnp.clip(noisy, modality.low, modality.high)
         else:
-            scores = jax.random.uniform(key_noise, block.shape)
-            replaced = jax.random.uniform(key_cell, block.shape[:-1]) < hparams.cell_noise
-            explored[name] = jnp.where(replaced[..., None], scores, block)
+            chance, scores = jnp.split(draws.uniform(key_block, (*block.shape[:-1], 1 + block.shape[-1])), [1], axis=-1)
+            explored[name] = jnp.where(chance < hparams.cell_noise, scores, block)
     return explored
 
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from apt_jax import draws
 from apt_jax import replay as rp
 from apt_jax.config import Config, HParams
 from apt_jax.curricula.base import GENERATED, Curriculum, Metrics
@@ -112,7 +113,7 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
         key_z, key_old, key_choice, key_noise, key_uniform = jax.random.split(key, 5)
         new = apply(generator, state.networks[0], jax.random.normal(key_z, (n, config.noise_size)))
         kept = jnp.minimum(state.memory.written, config.goal_memory)
-        old = state.memory.tasks[jax.random.randint(key_old, (n,), 0, jnp.maximum(kept, 1))]
+        old = state.memory.tasks[draws.integers(key_old, (n,), jnp.maximum(kept, 1))]
         again = (jax.random.uniform(key_choice, (n,)) < hparams.goal_old_share) & (kept > 0)
         task = jnp.where(again[:, None], old, new) + hparams.goal_noise * jax.random.normal(key_noise, (n, size))
         drawn = unflatten(space.param_spec, 0.5 * (task + 1.0))

@@ -44,10 +44,10 @@ def spectral_norm(
 
     The gradient reaches the kernel through sigma = u^T W v with u and v held constant (SN-GAN, eq. 11).
     """
-    fixed = lax.stop_gradient(kernel)
-    v = _unit(u @ fixed)
-    u = _unit(fixed @ v)
-    return u @ kernel @ v, u
+    v = _unit(u @ lax.stop_gradient(kernel))
+    image = kernel @ v
+    u = _unit(lax.stop_gradient(image))
+    return u @ image, u
 
 
 def spectral_normalize(

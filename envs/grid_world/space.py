@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt8
 
+from apt_jax import draws
 from apt_jax.specs import Obs, Params, Spec, param_struct
 from apt_jax.task_space import StepOutput
 from envs.grid_world import dynamics
@@ -41,7 +42,7 @@ class Space:
         key_tiles, key_xy = jax.random.split(key)
         struct = param_struct(self.param_spec)
         return {
-            "tiles": jax.random.uniform(key_tiles, struct["tiles"].shape),
+            "tiles": draws.uniform(key_tiles, struct["tiles"].shape),
             "xy": jax.random.uniform(key_xy, struct["xy"].shape, maxval=BOARD),
         }
 
