@@ -34,7 +34,9 @@ OPTIONS = shlex.split(
     --config.replay-episodes 16 --config.model-updates-per-step 0.25 --config.model-batch-size 4 --config.recent-steps 60
     --config.refresh-every 4 --config.eval-every 8 --config.eval-episodes 2 --config.probe-tasks 2 --config.return-window 4"""
 )
-UNDEFINED = {"probe_goal_way", "probe_can_distance", "behaviour_episode_return", "behaviour_success", "behaviour_length"}
+UNDEFINED = {"probe_goal_way", "probe_can_distance"} | {
+    f"{source}_{name}" for source in ("behaviour", "generated") for name in ("episode_return", "success", "length")
+}
 """Metrics that are NaN if no proposed task has the cans they are about, or no episode ended between two evaluations."""
 
 
