@@ -29,6 +29,16 @@ GAMMA: Mapping[str, float] = {"manipulation": 0.85, "manipulation_sawyer": 0.85}
 None of Manipulation's 15 pushes costs anything: at 0.99 the way and a detour differ by less than a network can tell.
 """
 
+TUNED: Mapping[tuple[str, str], Mapping[str, float]] = {
+    ("grid_world", "dqn"): {"gamma": 0.998},
+    ("grid_world", "random"): {"gamma": 0.998},
+    ("grid_world", "rnd"): {"rnd_scale": 0.1},
+}
+"""Baselines that learn better with other hyper-parameters than preset fast has for all, by space and method.
+
+Found by the search of experiments/NOTES.md, section 20; APT-Gen keeps one setting for every target.
+"""
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -68,7 +78,7 @@ class Session:
       run_dir: where everything is written; must be new, empty, or resumed.
       resume: go on from the run directory's checkpoint; the experiment defaults to what is saved there.
       preset: the config and hparams to start from, by default paper or what a resumed run was started with, but for a gamma of
-        the space's own; other options override single fields.
+        the space's own and, with fast, what was tuned for the method; other options override single fields.
       method: short for --config.method: apt_gen, apt_gen_progress_only, apt_gen_return_only, random, alp_gmm, goal_gan, dqn,
         icm, rnd, ride, or one with a bonus added as in "apt_gen+rnd".
       layout: how the lanes of one device are laid out; by default map on CPU and vmap on accelerators.
@@ -122,13 +132,14 @@ class _Basis:
     run_dir: Path | None = None
     resume: bool = False
     preset: Preset | None = None
+    method: Annotated[str, tyro.conf.arg(aliases=["--config.method"])] = Config.method
     space: str = Experiment.space
     target: str | None = None
     target_file: Path | None = None
 
 
 def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
-    """The command line; each option's default is the saved run's when resuming, else the preset's (gamma: see `GAMMA`).
+    """The command line; each option's default is the saved run's when resuming, else `starting_point`'s.
 
     Raises:
       UsageError: options that contradict each other or the saved run.
@@ -138,9 +149,8 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
     saved = load(basis.run_dir) if basis.resume and basis.run_dir else None
     default = saved or Experiment()
     if basis.preset or not saved:
-        config, hparams = PRESETS[basis.preset or "paper"]
-        gamma = GAMMA.get(saved.space if saved else basis.space, hparams.gamma)
-        default = dataclasses.replace(default, config=config, hparams=dataclasses.replace(hparams, gamma=gamma))
+        config, hparams = starting_point(basis.preset or "paper", saved.space if saved else basis.space, basis.method)
+        default = dataclasses.replace(default, config=config, hparams=hparams)
 
     def train(
         session: Annotated[Session, tyro.conf.arg(name="")],
@@ -163,6 +173,14 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
     if saved:
         check_resumable(saved, experiment)
     return experiment, session
+
+
+def starting_point(preset: Preset, space: str, method: str) -> tuple[Config, HParams]:
+    """The preset, with the space's own discount (`GAMMA`) and, for preset fast, what was tuned for the method (`TUNED`)."""
+    config, hparams = PRESETS[preset]
+    own = {"gamma": GAMMA[space]} if space in GAMMA else {}
+    tuned = TUNED.get((space, method), {}) if preset == "fast" else {}
+    return config, dataclasses.replace(hparams, **{**own, **tuned})
 
 
 def make_space(name: str) -> envs.BenchmarkSpace:

@@ -104,6 +104,26 @@ def test_a_space_may_have_a_discount_of_its_own(tmp_path, space):
     assert experiment.hparams.gamma == 0.9
 
 
+@pytest.mark.parametrize("option", ["--method", "--config.method"])
+def test_a_method_may_be_tuned_in_preset_fast(tmp_path, option):
+    def parse(*options):
+        return settings.parse(["--run-dir", str(tmp_path), *options])[0]
+
+    tuned = settings.TUNED["grid_world", "rnd"]
+    assert parse("--preset", "fast", option, "rnd").hparams == PRESETS["fast"][1].replace(**tuned)
+    assert parse("--preset", "fast", option, "rnd", "--hparams.rnd-scale", "0.7").hparams.rnd_scale == 0.7
+    assert parse("--preset", "fast", option, "apt_gen+rnd").hparams == PRESETS["fast"][1]
+    assert parse("--preset", "paper", option, "rnd").hparams == HParams()
+
+
+@pytest.mark.parametrize(("space", "method"), settings.TUNED)
+def test_what_is_tuned_exists(tmp_path, space, method):
+    envs.make(space)
+    assert method in METHODS
+    words = ["--run-dir", str(tmp_path), "--preset", "fast", "--space", space, "--method", method]
+    assert settings.parse(words)[0].hparams != settings.starting_point("fast", space, "apt_gen")[1]
+
+
 def test_a_file_does_not_hide_a_target_of_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("A", "mine"):
