@@ -58,16 +58,26 @@ def _standard_promotion(function: Callable[..., Any]) -> Callable[..., Any]:
 optax.tree.bias_correction = _standard_promotion(optax.tree.bias_correction)
 
 
-MAPS, ENOUGH = Path("/proc/self/maps"), 20_000
+MAPS, MANY, TOO_MANY = Path("/proc/self/maps"), 20_000, 45_000
 """Where Linux lists a process's memory maps; it allows 65,530 (`vm.max_map_count`)."""
 
 
-@pytest.fixture(autouse=True)
-def _drop_programs() -> Iterator[None]:
-    """Forgets compiled programs when there are many."""
-    yield
-    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > ENOUGH:
+def _drop_programs(limit: int) -> None:
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > limit:
         jax.clear_caches()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_programs_at_the_end_of_a_file() -> Iterator[None]:
+    """Within a file, tests share programs."""
+    yield
+    _drop_programs(MANY)
+
+
+@pytest.fixture(autouse=True)
+def _never_too_many_programs() -> Iterator[None]:
+    yield
+    _drop_programs(TOO_MANY)
 
 
 @pytest.fixture(autouse=True)

@@ -224,7 +224,8 @@ def test_generator_sizes():
 def test_blank_bias_gives_category_0_a_head_start():
     z, _ = noise_and_variables()
     generator = Generator(PARAM_SPEC, blank_bias=2.0)
-    w, _ = generator.apply(generator.init(jax.random.key(1), z, train=True), z, train=True, mutable=["batch_stats"])
+    variables = jax.jit(lambda key: generator.init(key, z, train=True))(jax.random.key(1))
+    w, _ = jax.jit(lambda z: generator.apply(variables, z, train=True, mutable=["batch_stats"]))(z)
     for name in ("tiles", "table"):
         blank = jnp.mean(jnp.argmax(w[name], axis=-1) == 0)
         assert 0.7 < blank < 0.95

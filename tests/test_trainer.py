@@ -350,19 +350,25 @@ def test_methods_learn_a_shorter_corridor(method):
     np.testing.assert_allclose(metrics["target_return_raw"], 0.96, atol=1e-5)
 
 
+@pytest.fixture(scope="module")
+def saved_between_chunks(tmp_path_factory):
+    """The end of a run of three chunks, and its checkpoint before each."""
+    path = tmp_path_factory.mktemp("checkpoints")
+    states, clock, _ = run(config(EVERYTHING), range(5), chunks=0)
+    for chunk in range(3):
+        checkpoint.save(path / str(chunk), int(clock.env_steps), (states, clock))
+        states, clock, _ = program(config(EVERYTHING), 5, "map").chunk(states, clock, stack_hparams([HParams()] * 5))
+    return states, clock, path
+
+
 @pytest.mark.parametrize("stop", [0, 1, 2])
-def test_resuming_from_a_checkpoint_equals_never_having_stopped(tmp_path, stop):
+def test_resuming_from_a_checkpoint_equals_never_having_stopped(saved_between_chunks, stop):
     """Bit for bit, in every leaf of the state, whichever chunk was the last before the stop."""
-    cfg, seeds = config(EVERYTHING), range(5)
-    straight, straight_clock, _ = run(cfg, seeds, chunks=3)
-    states, clock, _ = run(cfg, seeds, chunks=stop)
-    checkpoint.save(tmp_path, int(clock.env_steps), (states, clock))
-    template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), (states, clock))
-    lanes = stack_hparams([HParams()] * 5)
-    states, clock = checkpoint.restore(tmp_path, template)
+    *straight, path = saved_between_chunks
+    states, clock = checkpoint.restore(path / str(stop), tuple(straight))
     for _ in range(3 - stop):
-        states, clock, _ = program(cfg, 5, "map").chunk(states, clock, lanes)
-    for a, b in zip(leaves((states, clock)), leaves((straight, straight_clock)), strict=True):
+        states, clock, _ = program(config(EVERYTHING), 5, "map").chunk(states, clock, stack_hparams([HParams()] * 5))
+    for a, b in zip(leaves((states, clock)), leaves(straight), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
