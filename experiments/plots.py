@@ -10,12 +10,15 @@ import numpy as np
 from jaxtyping import Int, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from experiments.run_dir import Curves
 
 Image = UInt8[np.ndarray, "H W 3"]
 Run = tuple[Int[np.ndarray, "T"], Curves]
 """Environment steps of the evaluations, and the metrics then."""
+Block = tuple[str, Mapping[str, Run], str]
+"""A title, runs by name, and the metric of theirs to show."""
 
 PANELS = {
     "target_return": "Return on the target",
@@ -67,28 +70,70 @@ def learning_curves(file: Path, settings: Mapping[str, Run], *, delta: float | N
 def comparison(file: Path, panels: Mapping[str, Mapping[str, Run]], *, metrics: Sequence[str] = ("target_return",)) -> None:
     """Metrics of several runs, by panel and name: every seed thin, their mean thick.
 
-    A name has the same colour in every panel; a run that lacks a metric is left out there.
+    Up to `TOGETHER` names share a panel, with the same colour in every panel; of more, each has a small one to itself.  A run
+    that lacks a metric is left out there.
     """
     names = list(dict.fromkeys(name for runs in panels.values() for name in runs))
-    count = len(panels) * len(metrics)
+    blocks = [
+        (title, {name: run for name, run in runs.items() if metric in run[1]}, metric)
+        for title, runs in panels.items()
+        for metric in metrics
+    ]
+    figure = _together(blocks, names) if len(names) <= TOGETHER else _apart(blocks)
+    figure.savefig(file, dpi=150)
+
+
+TOGETHER = 6
+"""How many runs can be told apart in one panel."""
+
+
+def _together(blocks: Sequence[Block], names: Sequence[str]) -> Figure:
+    """A panel per block, side by side, a colour per name."""
+    count = len(blocks)
     legend_columns = 3 * count
     legend_height = 0.25 * -(-len(names) // legend_columns)
     figure = Figure(figsize=(7 if count == 1 else 5 * count, 4 + legend_height), layout="constrained")
     handles = {}
-    columns = [(title, runs, metric) for title, runs in panels.items() for metric in metrics]
-    for axes, (title, runs, metric) in zip(np.atleast_1d(figure.subplots(1, count)), columns, strict=True):
-        for name, (env_steps, curves) in runs.items():
-            if metric not in curves:
-                continue
-            colour, values = f"C{names.index(name)}", np.ma.masked_invalid(curves[metric])
-            for own in values:
-                axes.plot(env_steps, own, color=colour, linewidth=0.8, alpha=0.4)
-            (handles[name],) = axes.plot(env_steps, values.mean(axis=0), color=colour, linewidth=2.5)
+    for axes, (title, runs, metric) in zip(np.atleast_1d(figure.subplots(1, count)), blocks, strict=True):
+        for name, run in runs.items():
+            handles[name] = _seeds_and_mean(axes, run, metric, f"C{names.index(name)}")
         _decorate(axes, metric)
         if title:
             axes.set_title(title, fontsize="medium")
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=legend_columns, fontsize="small")
-    figure.savefig(file, dpi=150)
+    return figure
+
+
+def _apart(blocks: Sequence[Block]) -> Figure:
+    """Block below block, in each a small panel per run, all with the same axes."""
+    across = min(5, max(len(runs) for _, runs, _ in blocks))
+    downs = [max(1, -(-len(runs) // across)) for _, runs, _ in blocks]
+    figure = Figure(figsize=(2.3 * across, 1.9 * sum(downs) + 0.4 * len(blocks)), layout="constrained")
+    parts = figure.subfigures(len(blocks), 1, height_ratios=downs, squeeze=False).flat
+    for part, (title, runs, metric), down in zip(parts, blocks, downs, strict=True):
+        part.suptitle(", ".join(filter(None, (_TITLES.get(metric, metric), title))), fontsize="medium")
+        grid = list(part.subplots(down, across, sharex=True, sharey=True, squeeze=False).flat)
+        for axes in grid[len(runs) :]:
+            axes.set_visible(False)
+        for axes, run in zip(grid, runs.values(), strict=False):
+            _seeds_and_mean(axes, run, metric, "C0")
+        for index, (axes, name) in enumerate(zip(grid, runs, strict=False)):
+            _decorate(axes, metric)
+            axes.set_title(name, fontsize="small")
+            below = index + across < len(runs)
+            axes.tick_params(labelbottom=not below)
+            axes.set_xlabel("" if below else axes.get_xlabel(), fontsize="small")
+    return figure
+
+
+def _seeds_and_mean(axes: Axes, run: Run, metric: str, colour: str) -> Line2D:
+    """Every seed thin, their mean thick; returns the mean's line."""
+    env_steps, curves = run
+    values = np.ma.masked_invalid(curves[metric])
+    for own in values:
+        axes.plot(env_steps, own, color=colour, linewidth=0.8, alpha=0.4)
+    (line,) = axes.plot(env_steps, values.mean(axis=0), color=colour, linewidth=2.5)
+    return line
 
 
 def _decorate(axes: Axes, name: str) -> None:

@@ -45,6 +45,19 @@ def test_comparisons_have_a_panel_per_target_and_curves_a_colour_per_setting(tmp
     assert read(tmp_path / "sweep.png").std() > 0
 
 
+def test_many_runs_have_a_small_panel_each_where_they_have_the_metric(tmp_path):
+    run = (np.arange(1, 6) * 1000, {"target_return": np.linspace(0, 1, 10).reshape(2, 5)})
+    with_beta = (run[0], run[1] | {"beta": np.ones((2, 5))})
+    many = {"apt_gen": with_beta} | {f"run {index}": run for index in range(plots.TOGETHER)}
+    sizes = {}
+    for metrics in (("target_return",), ("target_return", "beta")):
+        plots.comparison(tmp_path / "many.png", {"A": many, "B": many}, metrics=metrics)
+        sizes[metrics] = read(tmp_path / "many.png").shape
+    (one, width, _), (two, same_width, _) = sizes.values()
+    assert one < two < 2 * one, "beta takes one row of panels, the return two"
+    assert width == same_width
+
+
 def test_progression_and_gallery(tmp_path):
     board = np.full((40, 40, 3), 90, np.uint8)
     plots.progression(tmp_path / "p.png", {0: [board, board], 5000: [board, board]}, board, rows=["seed 0", "seed 1"])
