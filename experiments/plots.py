@@ -35,6 +35,9 @@ _TITLES = PANELS | {
     "v2_correlation": "V2's correlation with return",
 }
 
+TOGETHER = 6
+"""How many runs can be told apart in one panel."""
+
 _MEAN_COLOUR = "black"
 _TARGET_COLOUR = "tab:green"
 
@@ -81,10 +84,6 @@ def comparison(file: Path, panels: Mapping[str, Mapping[str, Run]], *, metrics: 
     ]
     figure = _together(blocks, names) if len(names) <= TOGETHER else _apart(blocks)
     figure.savefig(file, dpi=150)
-
-
-TOGETHER = 6
-"""How many runs can be told apart in one panel."""
 
 
 def _together(blocks: Sequence[Block], names: Sequence[str]) -> Figure:

@@ -132,7 +132,8 @@ class _Basis:
     run_dir: Path | None = None
     resume: bool = False
     preset: Preset | None = None
-    method: Annotated[str, tyro.conf.arg(aliases=["--config.method"])] = Config.method
+    method: str | None = None
+    config_method: Annotated[str, tyro.conf.arg(name="config.method")] = Config.method
     space: str = Experiment.space
     target: str | None = None
     target_file: Path | None = None
@@ -149,7 +150,8 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
     saved = load(basis.run_dir) if basis.resume and basis.run_dir else None
     default = saved or Experiment()
     if basis.preset or not saved:
-        config, hparams = starting_point(basis.preset or "paper", saved.space if saved else basis.space, basis.method)
+        space, method = saved.space if saved else basis.space, basis.method or basis.config_method
+        config, hparams = starting_point(basis.preset or "paper", space, method)
         default = dataclasses.replace(default, config=config, hparams=hparams)
 
     def train(
@@ -176,7 +178,16 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
 
 
 def starting_point(preset: Preset, space: str, method: str) -> tuple[Config, HParams]:
-    """The preset, with the space's own discount (`GAMMA`) and, for preset fast, what was tuned for the method (`TUNED`)."""
+    """The preset, with the space's own discount (`GAMMA`) and, for preset fast, what was tuned for the method (`TUNED`).
+
+    Args:
+      preset: a name in `PRESETS`.
+      space: a task space's name; unknown ones have nothing of their own.
+      method: a method's full name, as in "rnd" or "apt_gen+rnd", which has nothing of "rnd"'s; unknown ones have nothing tuned.
+
+    Returns:
+      The preset's `Config`, whose `method` is the preset's still, and the hyper-parameters, a number each.
+    """
     config, hparams = PRESETS[preset]
     own = {"gamma": GAMMA[space]} if space in GAMMA else {}
     tuned = TUNED.get((space, method), {}) if preset == "fast" else {}

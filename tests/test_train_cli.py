@@ -112,6 +112,10 @@ def test_a_method_may_be_tuned_in_preset_fast(tmp_path, option):
     tuned = settings.TUNED["grid_world", "rnd"]
     assert parse("--preset", "fast", option, "rnd").hparams == PRESETS["fast"][1].replace(**tuned)
     assert parse("--preset", "fast", option, "rnd", "--hparams.rnd-scale", "0.7").hparams.rnd_scale == 0.7
+    assert (
+        parse("--preset", "fast", "--method", "dqn", "--config.method", "rnd").hparams.gamma
+        == settings.TUNED["grid_world", "dqn"]["gamma"]
+    )
     assert parse("--preset", "fast", option, "apt_gen+rnd").hparams == PRESETS["fast"][1]
     assert parse("--preset", "paper", option, "rnd").hparams == HParams()
 
