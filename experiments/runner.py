@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,6 +20,7 @@ from apt_jax.trainer import Clock, Trainer, TrainState
 from apt_jax.turns import Turns
 from experiments import processes, runtime
 from experiments.errors import UsageError
+from experiments.programs import Programs
 from experiments.run_dir import RunDir
 from experiments.settings import Experiment
 
@@ -35,7 +35,14 @@ class Runner:
       UsageError: fewer lanes than processes, or more than there is room for where they cannot take turns (`make_program`).
     """
 
-    def __init__(self, trainer: Trainer, experiment: Experiment, layout: Layout, at_once: int | None = None):
+    def __init__(
+        self,
+        trainer: Trainer,
+        experiment: Experiment,
+        layout: Layout,
+        at_once: int | None = None,
+        programs: Programs | None = None,
+    ):
         self._lanes = len(experiment.lanes)
         self._trainer = trainer
         memory = runtime.device_memory()
@@ -48,8 +55,9 @@ class Runner:
         self._propose = jax.jit(jax.vmap(trainer.propose, in_axes=(0, 0, None, 0)), static_argnums=2)
         self._states: TrainState
         self._clock: Clock
-        self._warmup: Callable[..., Any] = self._program.warmup
-        self._chunk: Callable[..., Any] = self._program.chunk
+        self.programs = programs or Programs()
+        self._warmup = self._program.warmup
+        self._chunk = self._program.chunk
         self.generates = trainer.generates
         self.env_steps = 0
 
@@ -65,7 +73,7 @@ class Runner:
     def init(self) -> float:
         """Fresh states, before anything else; returns the seconds that compiling took."""
         began = time.monotonic()
-        init = _compile(self._program.init, self._keys, self._hparams)
+        init = self.programs.compile("init", self._program.init, self._keys, self._hparams)
         seconds = time.monotonic() - began
         self._states = init(self._keys, self._hparams)
         self._clock = jax.device_put(Clock.start(), NamedSharding(self._mesh, PartitionSpec()))
@@ -74,9 +82,10 @@ class Runner:
     def compile(self) -> float:
         """Compiles what is still to run ahead of time; returns the seconds that took."""
         began = time.monotonic()
+        args = (self._states, self._clock, self._hparams)
         if not self.env_steps:
-            self._warmup = _compile(self._program.warmup, self._states, self._clock, self._hparams)
-        self._chunk = _compile(self._program.chunk, self._states, self._clock, self._hparams)
+            self._warmup = self.programs.compile("warmup", self._program.warmup, *args)
+        self._chunk = self.programs.compile("chunk", self._program.chunk, *args)
         return time.monotonic() - began
 
     def warmup(self) -> None:
@@ -181,7 +190,3 @@ def _even(mesh: Mesh, rows: int) -> Mesh:
 def _padded(lanes: int, rows: int) -> np.ndarray:
     """The lane of each row: the last one pads."""
     return np.minimum(np.arange(rows), lanes - 1)
-
-
-def _compile(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
-    return cast(jax.stages.Wrapped, function).lower(*args).compile()

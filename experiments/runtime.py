@@ -22,7 +22,7 @@ def setup(cpu_devices: int | None = None) -> None:
     Args:
       cpu_devices: devices the host CPU counts as, by default one per core this process may use.
     """
-    jax.config.update("jax_num_cpu_devices", cpu_devices or _cores())
+    jax.config.update("jax_num_cpu_devices", cpu_devices or cores())
     if not jax.config.values["jax_compilation_cache_dir"]:  # JAX itself reads JAX_COMPILATION_CACHE_DIR
         jax.config.update("jax_compilation_cache_dir", str(_cache_root() / "apt_jax" / "compiled"))
     jax.config.update("jax_default_matmul_precision", "highest")  # accelerators would round float32 inputs
@@ -69,7 +69,8 @@ def git_commit() -> str | None:
     return f"{commit}-dirty" if changes else commit
 
 
-def _cores() -> int:
+def cores() -> int:
+    """How many this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -18,6 +18,7 @@ from experiments import pictures, processes, run_dir, runtime
 from experiments.errors import UsageError, exit_with
 from experiments.interrupt import EXIT_CODE, Interrupt
 from experiments.problem import make_problem
+from experiments.programs import Programs
 from experiments.progress import Metrics, View, make_view
 from experiments.run_dir import RunDir
 from experiments.runner import Runner
@@ -51,7 +52,7 @@ def train(experiment: Experiment, session: Session) -> int:
     problem = make_problem(experiment)
     check_installed(session.sinks)
     processes.check_same(repr((experiment, dataclasses.replace(session, process_id=None))))
-    runner = Runner(problem.trainer, experiment, session.layout, session.at_once)
+    runner = Runner(problem.trainer, experiment, session.layout, session.at_once, kept_programs(experiment, session))
     run = RunDir(session.run_dir)
     if session.resume and processes.from_first(lambda: is_complete(run.path, experiment)):
         if processes.is_first():
@@ -81,6 +82,14 @@ def train(experiment: Experiment, session: Session) -> int:
             return EXIT_CODE
         view.note(f"finished {runner.env_steps:,} steps after {times.wall:.0f} s: {run.path}")
         return EXIT_CODE if processes.any_of(interrupt.requested) else 0  # asked to stop too late for this run, not for a next
+
+
+def kept_programs(experiment: Experiment, session: Session) -> Programs:
+    """Nothing is kept for several processes, nor where plug-ins, of which nobody knows all sources, have a part in it."""
+    if session.distributed or experiment.plugins:
+        return Programs()
+    target = experiment.target_file.read_bytes() if experiment.target_file else experiment.target
+    return Programs.of(experiment.space, target, experiment.config, len(experiment.lanes), session.layout, session.at_once)
 
 
 def open_sinks(experiment: Experiment, session: Session, start: int) -> list[Sink]:
@@ -138,14 +147,14 @@ class Training:
                 self.runner.save(self.run_dir.checkpoints)
 
     def _begin(self, start: int) -> None:
-        self.view.note("compiling; the result is kept for later runs")
+        self.view.note("compiling, or loading what an earlier start has compiled")
         self.times.compile = self._patiently(self.runner.init)
         if start:
             self.runner.restore(self.run_dir.checkpoints)
             self.view.note(f"restored {self.runner.env_steps:,} steps")
         if self._unfinished():
             self.times.compile += self._patiently(self.runner.compile)
-            self.view.note(f"compiled in {self.times.compile:.1f} s")
+            self.view.note(f"{'loaded' if self.runner.programs.loaded else 'compiled'} in {self.times.compile:.1f} s")
         if self.runner.env_steps == 0 and self._unfinished():
             self._patiently(self.runner.warmup)
             self._sample_tasks()

@@ -319,8 +319,9 @@ def test_an_interrupted_run_says_how_to_go_on_and_ends_complete(tmp_path, capsys
         stream.write("3,1")  # as a process killed while writing leaves it
 
     with launch(*shlex.split(command[1])) as process:
-        process.communicate()
+        output, _ = process.communicate()
     assert process.returncode == 0
+    assert "\nloaded in " in output
     assert rows(run) == [(seed, step) for step in range(300, 1300, 100) for seed in (3, 0, 5)]
     summary = json.loads((run / "summary.json").read_text())
     assert [lane["seed"] for lane in summary["lanes"]] == [3, 0, 5]

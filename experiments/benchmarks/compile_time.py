@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import tyro
@@ -25,6 +25,7 @@ from experiments import runtime
 from experiments.benchmarks import _measure
 from experiments.benchmarks._measure import Options, Timing
 from experiments.errors import exit_with
+from experiments.programs import Programs
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Start:
 
     Attributes:
       imports: from the request for a process to the benchmark's first line in it.
-      init: to trace, lower and compile `Program.init`, or to load it from the cache.
+      init: to trace, lower and compile `Program.init`, or to load what was kept of it.
       warmup: the same for `Program.warmup`.
       chunk: the same for `Program.chunk`.
       first_chunk: from the request for a process to the end of the first chunk, the steps before any update included.
@@ -124,13 +125,18 @@ def start(cache: Path, args: Args, *, requested: float) -> Start:
     space, target, config, one = _measure.load_problem(args.preset, space=args.space)
     program = make_program(make_trainer(space, target, config), args.seeds)
     hparams = stack_hparams([one] * args.seeds)
+    programs = Programs.of(args)
+
+    def compile_ahead(name: str, function: Callable[..., Any], *args: Any) -> tuple[Callable[..., Any], float]:
+        began = time.perf_counter()
+        return programs.compile(name, function, *args), time.perf_counter() - began
 
     keys = jax.random.split(jax.random.key(0), args.seeds)
-    init, init_seconds = _measure.compile_ahead(program.init, keys, hparams)
+    init, init_seconds = compile_ahead("init", program.init, keys, hparams)
     states, clock = init(keys, hparams), Clock.start()
-    warmup, warmup_seconds = _measure.compile_ahead(program.warmup, states, clock, hparams)
+    warmup, warmup_seconds = compile_ahead("warmup", program.warmup, states, clock, hparams)
     states, clock = warmup(states, clock, hparams)
-    chunk, chunk_seconds = _measure.compile_ahead(program.chunk, states, clock, hparams)
+    chunk, chunk_seconds = compile_ahead("chunk", program.chunk, states, clock, hparams)
     jax.block_until_ready(chunk(states, clock, hparams))
     return Start(
         imports=imports,

@@ -1,0 +1,144 @@
+"""Compiled programs kept whole: a later start loads them, and neither traces nor lowers nor compiles.
+
+JAX's own cache finds what XLA has made of a program only once it is traced and lowered again, which is two thirds of a start.
+Here a program is found by what it is made of: the sources of apt_jax and envs, versions, settings, the machine, and the types
+of its arguments.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import platform
+import warnings
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+from jax.experimental import serialize_executable
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
+
+import apt_jax
+import envs
+from experiments import runtime
+
+SOURCES = tuple(Path(package.__path__[0]) for package in (apt_jax, envs))
+"""Folders whose Python files, with what `make` and the arguments say, decide what is computed."""
+
+_FLAGS = ("XLA_FLAGS", "LIBTPU_INIT_ARGS")
+
+
+class Programs:
+    """Compiles, or loads what was compiled before.
+
+    Attributes:
+      loaded: programs that did not have to be compiled.
+    """
+
+    def __init__(self, folder: Path | None = None, made_of: str = ""):
+        """Those in `folder` that are made of the same; without a folder nothing is kept."""
+        self.loaded = 0
+        self._folder = folder
+        self._made_of = made_of
+
+    @classmethod
+    def of(cls, *parts: object) -> Programs:
+        """In JAX's cache directory, if there is one: those of `parts`, by their `repr`, for this machine as it is set up."""
+        directory = jax.config.values["jax_compilation_cache_dir"]
+        if not directory or not jax.config.values["jax_enable_compilation_cache"]:
+            return cls()
+        setting = (sorted(jax.config.values.items()), [os.environ.get(name) for name in _FLAGS])
+        return cls(Path(directory) / "programs", repr((parts, digest(SOURCES), setting, machine(), runtime.versions())))
+
+    def compile(self, name: str, function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
+        """What `function`, jitted, is for arguments of these types.
+
+        Args:
+          name: tells apart functions that are made of the same and have the same arguments.
+        """
+        wrapped = cast(jax.stages.Wrapped, function)
+        if self._folder is None:
+            return wrapped.lower(*args).compile()
+        leaves, structure = jax.tree.flatten(args)
+        key = repr((self._made_of, name, str(structure), [_type(leaf) for leaf in leaves]))
+        file = self._folder / f"{name}-{sha256(key.encode()).hexdigest()}"
+        if (kept := _load(file)) is not None:
+            self.loaded += 1
+            return kept
+        with _without_cache():
+            compiled = wrapped.lower(*args).compile()
+        if isinstance(compiled, jax.stages.Compiled):  # lanes that take turns are compiled to something of their own
+            _save(file, compiled)
+        return compiled
+
+
+def digest(folders: Sequence[Path]) -> str:
+    """Changes with every Python file's name and content."""
+    content = sha256()
+    for folder in folders:
+        for file in sorted(folder.rglob("*.py")):
+            content.update(repr((str(file.relative_to(folder)), file.read_bytes())).encode())
+    return content.hexdigest()
+
+
+def machine() -> tuple[object, ...]:
+    """What a program that runs here need not run on elsewhere, or not as well."""
+    info = Path("/proc/cpuinfo")
+    cpu = info.read_text().split("\n\n")[0] if info.is_file() else platform.processor()
+    features = [line for line in cpu.splitlines() if line.startswith(("model name", "flags", "Features"))]
+    device = jax.devices()[0]
+    versions = (device.device_kind, device.client.platform_version)
+    return platform.machine(), features or cpu, runtime.cores(), versions, runtime.device_memory()
+
+
+def _type(leaf: Any) -> tuple[object, ...]:
+    sharding = getattr(leaf, "sharding", None)
+    return jax.typeof(leaf), sharding, sharding and _ids(sharding)
+
+
+def _ids(sharding: jax.sharding.Sharding) -> list[int]:
+    return sorted(device.id for device in sharding.device_set)
+
+
+@contextmanager
+def _without_cache() -> Iterator[None]:
+    """JAX's cache set aside: what XLA has loaded from there can run, but loads no second time once it was saved again."""
+    jax.config.update("jax_enable_compilation_cache", False)
+    reset_cache()  # it asks for the setting only once
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_compilation_cache", True)
+        reset_cache()
+
+
+def _save(file: Path, compiled: jax.stages.Compiled) -> None:
+    """Whole or not at all, whoever else writes it; a run goes on without."""
+    ids = _ids(jax.tree.leaves(compiled.output_shardings)[0])
+    content = zlib.compress(pickle.dumps((serialize_executable.serialize(compiled), ids)), level=1)
+    own = file.with_name(f"{file.name}.{os.getpid()}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        own.write_bytes(content)
+        own.replace(file)
+    except OSError as error:
+        with suppress(OSError):
+            own.unlink()
+        warnings.warn(f"a compiled program could not be kept: {error}", stacklevel=2)
+
+
+def _load(file: Path) -> jax.stages.Compiled | None:
+    """None if there is none, or none that can be used."""
+    try:
+        (serialized, in_tree, out_tree), ids = pickle.loads(zlib.decompress(file.read_bytes()))
+        devices = [device for device in jax.devices() if device.id in ids]
+        return serialize_executable.deserialize_and_load(serialized, in_tree, out_tree, execution_devices=devices)
+    except OSError:
+        return None
+    except Exception as error:  # whatever a damaged file makes of itself
+        warnings.warn(f"{file} cannot be loaded and is made anew: {error}", stacklevel=2)
+        return None

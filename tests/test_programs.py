@@ -1,0 +1,174 @@
+"""A program that was compiled once is loaded by later starts, as long as it is made of the same."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from apt_jax.config import Config
+from experiments import programs
+from experiments.programs import Programs
+from experiments.settings import Experiment, Session
+from experiments.train import kept_programs
+
+
+class Doubling:
+    """A jitted function that donates its argument and counts how often it is traced."""
+
+    def __init__(self):
+        self.traced = 0
+
+        def double(state):
+            self.traced += 1
+            return {"x": 2 * state["x"], "key": jax.random.split(state["key"])[0]}
+
+        self.jitted = jax.jit(double, donate_argnums=0)
+
+
+def state(shape=(3,), dtype=np.float32, device=0):
+    on = NamedSharding(Mesh(np.array(jax.devices()[device : device + 1]), ("lane",)), PartitionSpec())
+    return jax.device_put({"x": jnp.ones(shape, dtype), "key": jax.random.key(0)}, on)
+
+
+def data(tree):
+    return np.asarray(tree["x"]), np.asarray(jax.random.key_data(tree["key"]))
+
+
+def test_a_second_start_traces_nothing_and_computes_the_same(tmp_path):
+    function = Doubling()
+    results, given = [], []
+    for loaded in (0, 1):
+        kept = Programs(tmp_path, "the same")
+        given.append(state())
+        results.append(data(kept.compile("double", function.jitted, given[-1])(given[-1])))
+        assert kept.loaded == loaded
+    assert function.traced == 1
+    assert all(tree["x"].is_deleted() for tree in given)
+    np.testing.assert_array_equal(results[0][0], [2, 2, 2])
+    for one, other in zip(*results, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("name", "made_of", "argument"),
+    [
+        ("triple", "one", {}),
+        ("double", "other", {}),
+        ("double", "one", {"shape": (4,)}),
+        ("double", "one", {"dtype": np.int32}),
+        ("double", "one", {"device": 1}),
+    ],
+)
+def test_what_differs_in_anything_is_another_program(tmp_path, name, made_of, argument):
+    Programs(tmp_path, "one").compile("double", Doubling().jitted, state())
+    kept = Programs(tmp_path, made_of)
+    result = kept.compile(name, Doubling().jitted, state(**argument))(state(**argument))
+    assert kept.loaded == 0
+    assert result["x"].sharding == state(**argument)["x"].sharding
+    again = Programs(tmp_path, made_of)
+    np.testing.assert_array_equal(
+        again.compile(name, Doubling().jitted, state(**argument))(state(**argument))["x"], result["x"]
+    )
+    assert again.loaded == 1
+
+
+def test_a_damaged_file_is_made_anew(tmp_path):
+    Programs(tmp_path).compile("double", Doubling().jitted, state())
+    (file,) = tmp_path.iterdir()
+    whole = file.read_bytes()
+    for damaged in (b"", whole[:-100], whole[:50] + b"x" + whole[51:]):
+        file.write_bytes(damaged)
+        with pytest.warns(UserWarning, match="cannot be loaded and is made anew"):
+            compiled = Programs(tmp_path).compile("double", Doubling().jitted, state())
+        np.testing.assert_array_equal(compiled(state())["x"], [2, 2, 2])
+        kept = Programs(tmp_path)
+        kept.compile("double", Doubling().jitted, state())
+        assert kept.loaded == 1
+
+
+def test_where_nothing_can_be_written_a_run_goes_on(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.warns(UserWarning, match="could not be kept"):
+        compiled = Programs(tmp_path / "file").compile("double", Doubling().jitted, state())
+    np.testing.assert_array_equal(compiled(state())["x"], [2, 2, 2])
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """JAX's cache directory, and sources that a test may change."""
+    (tmp_path / "sources").mkdir()
+    monkeypatch.setattr(programs, "SOURCES", (tmp_path / "sources",))
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "cache"))
+    yield tmp_path
+    jax.config.update("jax_compilation_cache_dir", before)
+    reset_cache()
+
+
+def found(kept: Programs) -> bool:
+    kept.compile("double", Doubling().jitted, state())
+    return kept.loaded == 1
+
+
+def test_a_run_finds_what_another_of_its_kind_has_compiled(cache):
+    experiment, session = Experiment(), Session(Path("run"))
+    own = dataclasses.replace(experiment, target_file=cache / "own.txt")
+    own.target_file.write_text("first")
+    kinds = [
+        (experiment, session),
+        (dataclasses.replace(experiment, seeds=(0, 1)), session),
+        (dataclasses.replace(experiment, config=Config(batch_size=64)), session),
+        (dataclasses.replace(experiment, target="B"), session),
+        (dataclasses.replace(experiment, space="manipulation"), session),
+        (own, session),
+        (experiment, dataclasses.replace(session, layout="vmap")),
+        (experiment, dataclasses.replace(session, at_once=2)),
+    ]
+    assert [found(kept_programs(*kind)) for kind in kinds] == [False] * len(kinds)
+    assert all(found(kept_programs(*kind)) for kind in kinds)
+    assert found(kept_programs(dataclasses.replace(experiment, seeds=(5, 6, 7, 8, 9), env_steps=20_000), session))
+    assert found(kept_programs(experiment, Session(Path("another run"), resume=True)))
+    own.target_file.write_text("second")
+    assert not found(kept_programs(own, session))
+
+
+def test_other_sources_are_another_program(cache):
+    file = cache / "sources" / "module.py"
+    assert not found(Programs.of("run"))
+    for text in ("x = 1", "x = 2"):
+        file.write_text(text)
+        assert not found(Programs.of("run"))
+        assert found(Programs.of("run"))
+    file.rename(file.with_name("other.py"))
+    assert not found(Programs.of("run"))
+
+
+def test_another_setting_of_jax_is_another_program(cache):
+    assert not found(Programs.of("run"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
+        assert not found(Programs.of("run"))
+    jax.config.update("jax_default_matmul_precision", "highest")
+    try:
+        assert not found(Programs.of("run"))
+    finally:
+        jax.config.update("jax_default_matmul_precision", None)
+    assert found(Programs.of("run"))
+
+
+def test_plug_ins_several_processes_and_no_cache_keep_nothing(cache):
+    experiment, session = Experiment(), Session(Path("run"))
+    for kind in (
+        (dataclasses.replace(experiment, plugins=("experiments.ladder_methods",)), session),
+        (experiment, dataclasses.replace(session, distributed=True)),
+    ):
+        assert not any(found(kept_programs(*kind)) for _ in range(2))
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert not any(found(kept_programs(experiment, session)) for _ in range(2))
