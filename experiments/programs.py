@@ -101,7 +101,8 @@ def _type(leaf: Any) -> tuple[object, ...]:
 
 
 def _ids(sharding: jax.sharding.Sharding) -> list[int]:
-    return sorted(device.id for device in sharding.device_set)
+    devices: set[jax.Device] = sharding.device_set
+    return sorted(device.id for device in devices)
 
 
 @contextmanager
