@@ -13,6 +13,7 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import TypeVar
 
+import envs
 from apt_jax import checkpoint
 from experiments import pictures, processes, run_dir, runtime
 from experiments.errors import UsageError, exit_with
@@ -52,7 +53,9 @@ def train(experiment: Experiment, session: Session) -> int:
     problem = make_problem(experiment)
     check_installed(session.sinks)
     processes.check_same(repr((experiment, dataclasses.replace(session, process_id=None))))
-    runner = Runner(problem.trainer, experiment, session.layout, session.at_once, kept_programs(experiment, session))
+    runner = Runner(
+        problem.trainer, experiment, session.layout, session.at_once, kept_programs(experiment, session, problem.space)
+    )
     run = RunDir(session.run_dir)
     if session.resume and processes.from_first(lambda: is_complete(run.path, experiment)):
         if processes.is_first():
@@ -84,9 +87,9 @@ def train(experiment: Experiment, session: Session) -> int:
         return EXIT_CODE if processes.any_of(interrupt.requested) else 0  # asked to stop too late for this run, not for a next
 
 
-def kept_programs(experiment: Experiment, session: Session) -> Programs:
-    """Nothing is kept for several processes, nor where plug-ins, of which nobody knows all sources, have a part in it."""
-    if session.distributed or experiment.plugins:
+def kept_programs(experiment: Experiment, session: Session, space: envs.BenchmarkSpace) -> Programs:
+    """Programs are kept for one process whose task space and method come with this project: then all sources are known."""
+    if session.distributed or experiment.plugins or not type(space).__module__.startswith(f"{envs.__name__}."):
         return Programs()
     target = experiment.target_file.read_bytes() if experiment.target_file else experiment.target
     return Programs.of(experiment.space, target, experiment.config, len(experiment.lanes), session.layout, session.at_once)

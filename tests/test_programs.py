@@ -12,11 +12,13 @@ import pytest
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+import envs
 from apt_jax.config import Config
 from experiments import programs
 from experiments.programs import Programs
 from experiments.settings import Experiment, Session
 from experiments.train import kept_programs
+from tests.corridor import Corridor
 
 
 class Doubling:
@@ -45,10 +47,10 @@ def test_a_second_start_traces_nothing_and_computes_the_same(tmp_path):
     function = Doubling()
     results, given = [], []
     for loaded in (0, 1):
-        kept = Programs(tmp_path, "the same")
+        own = Programs(tmp_path, "the same")
         given.append(state())
-        results.append(data(kept.compile("double", function.jitted, given[-1])(given[-1])))
-        assert kept.loaded == loaded
+        results.append(data(own.compile("double", function.jitted, given[-1])(given[-1])))
+        assert own.loaded == loaded
     assert function.traced == 1
     assert all(tree["x"].is_deleted() for tree in given)
     np.testing.assert_array_equal(results[0][0], [2, 2, 2])
@@ -68,11 +70,11 @@ def test_a_second_start_traces_nothing_and_computes_the_same(tmp_path):
 )
 def test_what_differs_in_anything_is_another_program(tmp_path, name, made_of, argument):
     Programs(tmp_path, "one").compile("double", Doubling().jitted, state())
-    kept = Programs(tmp_path, made_of)
+    own = Programs(tmp_path, made_of)
     expected = state(**argument)["x"]
     for loaded in (0, 1):
-        result = kept.compile(name, Doubling().jitted, state(**argument))(state(**argument))["x"]
-        assert kept.loaded == loaded
+        result = own.compile(name, Doubling().jitted, state(**argument))(state(**argument))["x"]
+        assert own.loaded == loaded
         assert (result.shape, result.dtype, result.sharding) == (expected.shape, expected.dtype, expected.sharding)
 
 
@@ -85,9 +87,7 @@ def test_a_damaged_file_is_made_anew(tmp_path):
         with pytest.warns(UserWarning, match="cannot be loaded and is made anew"):
             compiled = Programs(tmp_path).compile("double", Doubling().jitted, state())
         np.testing.assert_array_equal(compiled(state())["x"], [2, 2, 2])
-        kept = Programs(tmp_path)
-        kept.compile("double", Doubling().jitted, state())
-        assert kept.loaded == 1
+        assert found(Programs(tmp_path))
 
 
 def test_where_nothing_can_be_written_a_run_goes_on(tmp_path):
@@ -109,9 +109,13 @@ def cache(tmp_path, monkeypatch):
     reset_cache()
 
 
-def found(kept: Programs) -> bool:
-    kept.compile("double", Doubling().jitted, state())
-    return kept.loaded == 1
+def found(own: Programs) -> bool:
+    own.compile("double", Doubling().jitted, state())
+    return own.loaded == 1
+
+
+def kept(experiment: Experiment, session: Session, space: str = "grid_world") -> Programs:
+    return kept_programs(experiment, session, envs.make(space))
 
 
 def test_a_run_finds_what_another_of_its_kind_has_compiled(cache):
@@ -128,12 +132,25 @@ def test_a_run_finds_what_another_of_its_kind_has_compiled(cache):
         (experiment, dataclasses.replace(session, layout="vmap")),
         (experiment, dataclasses.replace(session, at_once=2)),
     ]
-    assert [found(kept_programs(*kind)) for kind in kinds] == [False] * len(kinds)
-    assert all(found(kept_programs(*kind)) for kind in kinds)
-    assert found(kept_programs(dataclasses.replace(experiment, seeds=(5, 6, 7, 8, 9), env_steps=20_000), session))
-    assert found(kept_programs(experiment, Session(Path("another run"), resume=True)))
+    assert [found(kept(*kind)) for kind in kinds] == [False] * len(kinds)
+    assert all(found(kept(*kind)) for kind in kinds)
+    assert found(kept(dataclasses.replace(experiment, seeds=(5, 6, 7, 8, 9), env_steps=20_000), session))
+    assert found(kept(experiment, Session(Path("another run"), resume=True)))
     own.target_file.write_text("second")
-    assert not found(kept_programs(own, session))
+    assert not found(kept(own, session))
+
+
+def test_what_has_sources_of_others_several_processes_or_no_cache_is_not_kept(cache, monkeypatch):
+    experiment, session = Experiment(), Session(Path("run"))
+    monkeypatch.setitem(envs.SPACES, "corridor", Corridor)
+    for kind in (
+        (dataclasses.replace(experiment, plugins=("experiments.ladder_methods",)), session),
+        (experiment, session, "corridor"),
+        (experiment, dataclasses.replace(session, distributed=True)),
+    ):
+        assert not any(found(kept(*kind)) for _ in range(2))
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert not any(found(kept(experiment, session)) for _ in range(2))
 
 
 def test_other_sources_are_another_program(cache):
@@ -158,14 +175,3 @@ def test_another_setting_of_jax_is_another_program(cache):
     finally:
         jax.config.update("jax_default_matmul_precision", None)
     assert found(Programs.of("run"))
-
-
-def test_plug_ins_several_processes_and_no_cache_keep_nothing(cache):
-    experiment, session = Experiment(), Session(Path("run"))
-    for kind in (
-        (dataclasses.replace(experiment, plugins=("experiments.ladder_methods",)), session),
-        (experiment, dataclasses.replace(session, distributed=True)),
-    ):
-        assert not any(found(kept_programs(*kind)) for _ in range(2))
-    jax.config.update("jax_compilation_cache_dir", None)
-    assert not any(found(kept_programs(experiment, session)) for _ in range(2))

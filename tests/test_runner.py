@@ -1,4 +1,4 @@
-"""Seeds that do not fit the devices' memory take turns on them, and nothing else changes."""
+"""Programs that were kept do what they did; seeds that do not fit the devices' memory take turns, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from apt_jax.config import Config
 from apt_jax.lanes import lane_bytes
 from apt_jax.trainer import make_trainer
 from experiments import runtime
+from experiments.programs import Programs
 from experiments.runner import Runner
 from experiments.settings import Experiment
 from tests.corridor import Corridor
@@ -35,36 +36,40 @@ def experiment():
     return Experiment(seeds=(3, 0, 4, 1, 2), config=config), make_trainer(Corridor(), np.int32(7), config)
 
 
-def start(experiment, trainer):
+def start(experiment, trainer, programs=None):
     """A runner that is compiled, but has not run."""
-    runner = Runner(trainer, experiment, "map")
+    runner = Runner(trainer, experiment, "map", programs=programs)
     runner.init()
     runner.compile()
     return runner
 
 
 def test_seeds_that_do_not_fit_take_turns(experiment, monkeypatch, tmp_path):
-    """Two devices with room for two seeds each, against all at once; and a checkpoint of one goes on in the other.
+    """Two devices with room for two seeds each, against all at once, just compiled and loaded; a checkpoint of one goes on in
+    the other.
 
     Both ways a device loops over its seeds, so that XLA computes them alike, to the last bit.
     """
-    together = start(*experiment)
+    together = start(*experiment, Programs(tmp_path / "programs"))
+    again = start(*experiment, Programs(tmp_path / "programs"))
+    assert again.programs.loaded == 3
     assert together.placement.startswith("5 lanes of 0.")
     monkeypatch.setattr(runtime, "device_memory", lambda: 4 * lane_bytes(experiment[1]))
     in_turns = start(*experiment)
     assert in_turns.placement.endswith("do not fit the devices' memory: 4 at a time take turns, the others wait in the host's")
 
-    for runner in (together, in_turns):
+    for runner in (together, again, in_turns):
         runner.warmup()
-    expected, metrics = together.advance(), in_turns.advance()
-    assert metrics.keys() == expected.keys()
-    for name, values in metrics.items():
-        np.testing.assert_array_equal(values, expected[name])
+    expected = together.advance()
+    for metrics in (again.advance(), in_turns.advance()):
+        assert metrics.keys() == expected.keys()
+        for name, values in metrics.items():
+            np.testing.assert_array_equal(values, expected[name])
 
-    in_turns.save(tmp_path)
+    in_turns.save(tmp_path / "checkpoints")
     expected = together.advance()
     for runner in (in_turns, together):
-        runner.restore(tmp_path)
+        runner.restore(tmp_path / "checkpoints")
         assert runner.env_steps == 60
         np.testing.assert_array_equal(runner.advance()["td_loss"], expected["td_loss"])
         assert all(leaf.shape[0] == 5 for leaf in jax.tree.leaves(runner.policies()))
