@@ -27,7 +27,7 @@ import envs
 from experiments import runtime
 
 SOURCES = tuple(Path(package.__path__[0]) for package in (apt_jax, envs))
-"""Folders whose Python files, with what `make` and the arguments say, decide what is computed."""
+"""Folders whose Python files decide what is computed, with what `Programs.of` is told."""
 
 _FLAGS = ("XLA_FLAGS", "LIBTPU_INIT_ARGS")
 
@@ -119,14 +119,14 @@ def _without_cache() -> Iterator[None]:
 
 def _save(file: Path, compiled: jax.stages.Compiled) -> None:
     """Whole or not at all, whoever else writes it; a run goes on without."""
-    ids = _ids(jax.tree.leaves(compiled.output_shardings)[0])
-    content = zlib.compress(pickle.dumps((serialize_executable.serialize(compiled), ids)), level=1)
     own = file.with_name(f"{file.name}.{os.getpid()}")
     try:
+        ids = _ids(jax.tree.leaves(compiled.output_shardings)[0])
+        content = pickle.dumps((serialize_executable.serialize(compiled), ids))
         file.parent.mkdir(parents=True, exist_ok=True)
-        own.write_bytes(content)
+        own.write_bytes(zlib.compress(content, level=1))
         own.replace(file)
-    except OSError as error:
+    except Exception as error:  # a full disk, or a device whose programs cannot be saved
         with suppress(OSError):
             own.unlink()
         warnings.warn(f"a compiled program could not be kept: {error}", stacklevel=2)
