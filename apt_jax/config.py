@@ -28,6 +28,8 @@ class HParams:
       generator_learning_rate: Adam step size of the generator, >= 0 (paper: 3e-4).
       gamma: discount of the Q-learning target, in [0, 1].
       target_rate: Polyak rate of the target network per policy update, in [0, 1] (the paper names none).
+      reset_every: environment steps between resets of the Q-network, replay kept, for as long as the kept policy's return on
+        the target is not above 0, > 0 (the paper has none: infinite).
       epsilon_start: exploration right after warm-up, in [0, 1].
       epsilon_end: exploration in the long run, in [0, 1].
       epsilon_steps: environment steps over which epsilon falls linearly, > 0.
@@ -67,6 +69,7 @@ class HParams:
     generator_learning_rate: float = 3e-4
     gamma: float = 0.99
     target_rate: float = 0.005
+    reset_every: float = math.inf
     epsilon_start: float = 1.0
     epsilon_end: float = 0.1
     epsilon_steps: float = 1_000.0
@@ -101,7 +104,7 @@ def check_hparams(hparams: HParams) -> None:
     Raises:
       ValueError: the field, its value, and what is allowed.
     """
-    positive = ("epsilon_steps", "beta_min", "spectral_bound", "alp_regularisation")
+    positive = ("reset_every", "epsilon_steps", "beta_min", "spectral_bound", "alp_regularisation")
     not_negative = ("tolerance", "pessimism", "value_weight_decay", "vector_noise", "vector_prior", "goal_noise")
     rates = tuple(field.name for field in dataclasses.fields(hparams) if field.name.endswith("learning_rate"))
     scales = ("icm_scale", "rnd_scale", "ride_scale")

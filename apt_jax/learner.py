@@ -116,3 +116,31 @@ def keep_or_restore(state: LearnerState, kept: Kept, score: Float[Array, ""]) ->
     drop = (kept.score > 0.0) & ~(score >= kept.score)
     learner = jax.tree.map(lambda old, new: jnp.where(drop, old, new), kept.learner, state)
     return learner, Kept(learner, jnp.where(drop, kept.score, score)), drop
+
+
+def reset(
+    network: QNetwork,
+    state: LearnerState,
+    kept: Kept,
+    key: Key[Array, ""],
+    *,
+    steps: Int[Array, ""],
+    every: int,
+    hparams: HParams,
+) -> tuple[LearnerState, Bool[Array, ""]]:
+    """A fresh Q-function every `reset_every` steps while what is kept earns nothing on the target; consumes `key`.
+
+    Where nothing is reached, whatever was visited often is worth little, and so is, by then, what lies beyond it.  A fresh
+    network explores once more, with a replay that knows the way (Nikishin et al. 2022, "The Primacy Bias in Deep
+    Reinforcement Learning").
+
+    Args:
+      steps: environment steps after warm-up.
+      every: steps between two calls.
+
+    Returns:
+      The learner to go on with, and whether it is fresh.
+    """
+    now, before = (jnp.floor(count.astype(jnp.float32) / hparams.reset_every) for count in (steps, steps - every))
+    due = (now > before) & ~(kept.score > 0.0)
+    return jax.tree.map(lambda new, old: jnp.where(due, new, old), init(network, key), state), due

@@ -205,16 +205,18 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
     def evaluate(state: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Metrics]:
         """Greedy return on the target, the restore rule, and the curriculum judged on fresh tasks, by the averaged policy.
 
-        Draws from `key_eval` alone: how often it is done changes no draw of training, but how often the restore rule is asked.
+        Draws from `key_eval` alone: how often it is done changes no draw of training, but how often the restore rule is asked,
+        and the resets.
         """
-        key_propose, key_play, key_steps = jax.random.split(jax.random.fold_in(state.key_eval, clock.env_steps), 3)
+        key_propose, key_play, key_steps, key_reset = jax.random.split(jax.random.fold_in(state.key_eval, clock.env_steps), 4)
+        trained = clock.env_steps - config.warmup_steps
         episodes = config.eval_episodes
         tasks = jax.tree.map(lambda x: jnp.broadcast_to(x, (episodes, *jnp.shape(x))), state.target)
         epsilon = jnp.zeros(episodes)
         w = curriculum.propose(state.curriculum, key_propose, config.probe_tasks, hparams) if curriculum.generates else None
         if w is not None:
             tasks = jax.tree.map(lambda *sources: jnp.concatenate(sources), tasks, jax.vmap(space.instantiate)(w))
-            explores = learner.epsilon_schedule(clock.env_steps - config.warmup_steps, hparams)
+            explores = learner.epsilon_schedule(trained, hparams)
             epsilon = jnp.concatenate([epsilon, jnp.full(config.probe_tasks, explores)])
 
         def act(obs: Obs, key: Key[Array, ""]) -> Int[Array, "n"]:
@@ -224,12 +226,16 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         played = evaluation.play(space, tasks, act, key_play)
         outcome, _ = jax.tree.map(lambda x: x[:episodes], played)
         score = jnp.mean(outcome.episode_return)
-        kept_learner, kept, restored = learner.keep_or_restore(state.learner, state.kept, score)
+        learner_state, kept, restored = learner.keep_or_restore(state.learner, state.kept, score)
+        learner_state, reset = learner.reset(
+            network, learner_state, kept, key_reset, steps=trained, every=config.eval_every, hparams=hparams
+        )
         metrics = {
             "target_return": kept.score,
             "target_return_raw": score,
             "target_success_raw": jnp.mean(outcome.success.astype(jnp.float32)),
             "restored": restored.astype(jnp.float32),
+            "reset": reset.astype(jnp.float32),
             **_sources(state.replay, config.return_window, since=config.warmup_steps // steps),
         }
         if w is not None:
@@ -243,7 +249,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
                 **{f"probe_{name}": jnp.nanmean(values) for name, values in descriptions.items()},
                 **curriculum.report(state.curriculum, rollouts, hparams),
             }
-        return state._replace(learner=kept_learner, kept=kept), metrics
+        return state._replace(learner=learner_state, kept=kept), metrics
 
     def chunk(state: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock, Metrics]:
         def refresh_period(carry: tuple[TrainState, Clock], _: None) -> tuple[tuple[TrainState, Clock], Metrics]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,6 +61,29 @@ def test_equality_is_no_drop():
     state, _, drop = learner.keep_or_restore(new, learner.Kept(_marked(1), jnp.float32(0.5)), jnp.float32(0.5))
     assert not drop
     assert state == new
+
+
+@pytest.mark.parametrize(
+    ("score", "reset_every", "expected"),
+    [
+        (-0.1, 300.0, [300, 600, 900]),
+        (0.0, 250.0, [300, 500, 800, 1000]),
+        (float("nan"), 50.0, list(range(100, 1100, 100))),
+        (0.1, 300.0, []),
+        (-0.1, float("inf"), []),
+    ],
+)
+def test_the_q_function_starts_anew_while_nothing_is_reached(score, reset_every, expected):
+    old = learner.init(NETWORK, jax.random.key(0))
+    old = old._replace(target_params=jax.tree.map(lambda x: x + 1, old.params))
+    kept = learner.Kept(old, jnp.float32(score))
+    hparams, resets = HParams(reset_every=reset_every), []
+    for steps in range(100, 1100, 100):
+        key = jax.random.key(steps)
+        state, reset = learner.reset(NETWORK, old, kept, key, steps=jnp.int32(steps), every=100, hparams=hparams)
+        chex.assert_trees_all_equal(state, learner.init(NETWORK, jax.random.clone(key)) if reset else old)
+        resets += [steps] * bool(reset)
+    assert resets == expected
 
 
 def test_epsilon_falls_linearly_then_stays():

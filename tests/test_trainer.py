@@ -15,6 +15,7 @@ from jax.sharding import PartitionSpec
 import envs
 from apt_jax import checkpoint
 from apt_jax.config import PRESETS, Config, HParams
+from apt_jax.descent import has_learned
 from apt_jax.lanes import _spread, lane_bytes, make_program, room, stack_hparams
 from apt_jax.methods import METHODS, Method, parse_method
 from apt_jax.trainer import Clock, diversity, make_trainer
@@ -318,6 +319,16 @@ def test_evaluating_more_often_changes_nothing_in_training():
     assert not np.any([metrics["restored"] for metrics in history])
     for a, b in zip(leaves(often.replay), leaves(seldom.replay), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_an_unsolved_run_resets_its_q_function_and_nothing_else():
+    slow = HParams(learning_rate=1e-5)
+    states, _, history = run(config("random"), [2, 2], hparams=[slow, slow.replace(reset_every=2.0 * CONFIG.eval_every)])
+    assert (states.kept.score < 0).all(), "the target must be unsolved"
+    assert [metrics["reset"].tolist() for metrics in history] == [[0, 0], [0, 1]]
+    assert has_learned(states.learner.opt_state).tolist() == [True, False]
+    for leaf in leaves((states.replay, states.workers, states.kept)):
+        np.testing.assert_array_equal(leaf[0], leaf[1])
 
 
 def test_target_source_plays_only_the_target_and_the_generated_source_its_w():
