@@ -36,12 +36,13 @@ class Programs:
     """Compiles, or loads what was compiled before.
 
     Attributes:
-      loaded: programs that did not have to be compiled.
+      loaded: how many did not have to be compiled.
+      compiled: how many had to be.
     """
 
     def __init__(self, folder: Path | None = None, made_of: str = ""):
         """Those in `folder` that are made of the same; without a folder nothing is kept."""
-        self.loaded = 0
+        self.loaded = self.compiled = 0
         self._folder = folder
         self._made_of = made_of
 
@@ -62,6 +63,7 @@ class Programs:
         """
         wrapped = cast(jax.stages.Wrapped, function)
         if self._folder is None:
+            self.compiled += 1
             return wrapped.lower(*args).compile()
         leaves, structure = jax.tree.flatten(args)
         key = repr((self._made_of, name, str(structure), [_type(leaf) for leaf in leaves]))
@@ -69,6 +71,7 @@ class Programs:
         if (kept := _load(file)) is not None:
             self.loaded += 1
             return kept
+        self.compiled += 1
         with _without_cache():
             compiled = wrapped.lower(*args).compile()
         if isinstance(compiled, jax.stages.Compiled):  # lanes that take turns are compiled to something of their own

@@ -157,7 +157,7 @@ class Training:
             self.view.note(f"restored {self.runner.env_steps:,} steps")
         if self._unfinished():
             self.times.compile += self._patiently(self.runner.compile)
-            self.view.note(f"{'loaded' if self.runner.programs.loaded else 'compiled'} in {self.times.compile:.1f} s")
+            self.view.note(f"{'compiled' if self.runner.programs.compiled else 'loaded'} in {self.times.compile:.1f} s")
         if self.runner.env_steps == 0 and self._unfinished():
             self._patiently(self.runner.warmup)
             self._sample_tasks()
