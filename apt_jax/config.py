@@ -241,6 +241,7 @@ PRESETS: dict[str, tuple[Config, HParams]] = {
         HParams(
             learning_rate=1e-3,
             target_rate=0.02,
+            reset_every=20_000.0,
             generator_learning_rate=7e-4,
             value_weight_decay=10.0,
             cell_noise=0.03,
