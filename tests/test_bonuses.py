@@ -148,6 +148,19 @@ def test_rnd_pays_less_for_what_it_has_seen_and_nothing_once_the_target_is_learn
         np.testing.assert_array_equal(a, b, err_msg="the target network must stay as it is")
 
 
+def test_rnds_unit_is_of_what_a_predictor_that_learns_pays():
+    space, bonus = Lock(), BONUSES["rnd"](Lock(), CONFIG)
+    state = bonus.init(jax.random.key(0), jnp.zeros((1, 3)), HParams())
+    step = lock_steps([0, 1, 2], [1, 2, 3])
+    warm, _ = bonus.annotate(state, step, HParams())
+    for a, b in zip((state.filtered, *state.scale), (warm.filtered, *warm.scale), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert (warm.features["place"].samples > state.features["place"].samples).all()
+    learned = played(bonus, space, [1, 2, 3], rounds=3)
+    np.testing.assert_allclose(learned.scale.samples, 2 * 3, atol=1e-3)
+    assert (learned.filtered > 0).all()
+
+
 def test_rnd_pays_nothing_where_predictor_and_target_agree(monkeypatch):
     class Same(rnd.Distillation):
         """Both networks alike."""
@@ -168,7 +181,7 @@ def test_rnd_pays_nothing_where_predictor_and_target_agree(monkeypatch):
 
 
 def test_the_stream_sums_whole_episodes_bonus_included():
-    stream = Stream.start((1, 2))
+    stream = Stream.start((1, 2)).step(jnp.zeros((1, 2)), jnp.array([[True, True]]), learning=jnp.bool(True))
     for reward, done in (([1.0, -2.0], [False, False]), ([0.5, 1.0], [True, False]), ([9.0, 0.25], [False, True])):
         stream = stream.step(jnp.array([reward]), jnp.array([done]), learning=jnp.bool(True))
     np.testing.assert_allclose(stream.highest, 1.5)
@@ -176,13 +189,20 @@ def test_the_stream_sums_whole_episodes_bonus_included():
 
 
 def test_what_the_warm_up_paid_widens_no_clip():
-    """Above by the bonuses since learning began, below by what the environment paid."""
-    done, paid = jnp.array([[True, True]]), ReturnRange(jnp.float32(-0.5), jnp.float32(1.0))
-    replay = SimpleNamespace(returns=paid)
-    stream = Stream.start((1, 2)).step(jnp.array([[40.0, 30.0]]), done, learning=jnp.bool(False))
-    np.testing.assert_array_equal(stream.bounds(replay), (-0.5, np.inf))
-    stream = stream.step(jnp.array([[2.0, 3.0]]), done, learning=jnp.bool(True))
-    np.testing.assert_array_equal(stream.bounds(replay), (-0.5, 3.0))
+    """Above by the bonuses of episodes that began after learning did, below by what the environment paid."""
+    replay = SimpleNamespace(returns=ReturnRange(jnp.float32(-0.5), jnp.float32(1.0)))
+    stream, highest = Stream.start((1, 2)), []
+    for reward, done, learning in (
+        ([40.0, 30.0], [True, False], False),
+        ([20.0, 30.0], [False, False], False),
+        ([2.0, 3.0], [True, True], True),
+        ([2.0, 3.0], [True, True], True),
+    ):
+        stream = stream.step(jnp.array([reward]), jnp.array([done]), learning=jnp.bool(learning))
+        low, high = stream.bounds(replay)
+        assert low == -0.5
+        highest.append(float(high))
+    assert highest == [np.inf, np.inf, np.inf, 3.0]
 
 
 def test_the_null_bonus_computes_and_keeps_nothing():

@@ -35,15 +35,16 @@ def progress(w, returns, window=None):
     return np.asarray(alp_gmm.learning_progress(w, r, earlier, window=window))[::-1]
 
 
-def brute_force(w, returns):
-    """Learning progress by its definition, oldest first."""
+def brute_force(w, returns, history=None):
+    """Learning progress by its definition, oldest first; compared with the `history` episodes before, by default all."""
     w, values = np.asarray(w, np.float32), []
     for i in range(len(w)):
-        distance = np.array([np.sum((w[j] - w[i]) ** 2, dtype=np.float32) for j in range(i)])
+        first = 0 if history is None else max(i - history, 0)
+        distance = np.array([np.sum((w[j] - w[i]) ** 2, dtype=np.float32) for j in range(first, i)])
         if i <= 5:
             values.append(0.0)
         else:
-            newest = max(np.flatnonzero(distance == distance.min()))
+            newest = first + max(np.flatnonzero(distance == distance.min()))
             values.append(abs(returns[i] - returns[newest]))
     return values
 
@@ -60,6 +61,9 @@ def test_learning_progress_equals_its_definition(episodes):
     w = [episode[:2] for episode in episodes]
     returns = [episode[2] / 4 for episode in episodes]
     np.testing.assert_allclose(progress(w, returns), brute_force(w, returns), atol=1e-6)
+    newest, earlier = (jnp.asarray(np.asarray(x, np.float32)[::-1]) for x in (w, returns))
+    short = alp_gmm.learning_progress(newest, earlier, 11 - jnp.arange(12, dtype=jnp.int32), window=8)
+    np.testing.assert_allclose(short[::-1], brute_force(w, returns, history=4)[4:], atol=1e-6)
 
 
 def test_components_are_drawn_by_their_progress():

@@ -143,3 +143,15 @@ def test_a_key_once_taken_stays_taken(actions):
         state = step(state, jnp.asarray(action), task).state
         taken |= (np.asarray(state.position) == key_places).all(axis=-1)
         np.testing.assert_array_equal(state.keys, taken)
+
+
+def test_states_are_told_apart_by_place_and_keys_held():
+    task = parse_layout("Ay......\nb.......\n" + "........\n" * 5 + ".......G")
+    start, _ = SPACE.reset(jax.random.key(0), task)
+    right, left = jnp.int32(1), jnp.int32(3)
+    taken = step(start, right, task).state
+    back = step(taken, left, task).state
+    here, there = np.asarray(SPACE.fingerprint(start)), np.asarray(SPACE.fingerprint(back))
+    assert (here[:2] == there[:2]).all(), "the same place"
+    assert (here[2:] != there[2:]).sum() == 1, "with one key more"
+    assert (np.asarray(SPACE.fingerprint(taken))[:2] != here[:2]).any()

@@ -75,7 +75,7 @@ def test_agrees_with_scikit_learn_for_every_number_of_components_at_once():
     rows = np.concatenate([rng.normal(centre, 0.15, (40, 3)) for centre in ([0, 0, 0], [1, 0, 1], [0, 2, 1])]).astype(
         np.float32
     )
-    ks = np.arange(2, 8, dtype=np.int32)
+    ks = np.arange(2, 11, dtype=np.int32)
     labels = np.stack([np.arange(len(rows), dtype=np.int32) * 7919 % k for k in ks])
     padding = 9
     padded = jnp.asarray(np.concatenate([rows, np.full((padding, 3), 50.0, np.float32)]))
@@ -131,3 +131,13 @@ def test_k_means_tells_separate_clusters_apart():
     labels = np.asarray(k_means(rows, jnp.ones(60, bool), jnp.int32(3), jax.random.key(2), slots=6)).reshape(3, 20)
     assert (labels == labels[:, :1]).all()
     assert sorted(labels[:, 0]) == [0, 1, 2]
+
+
+def test_k_means_begins_far_apart():
+    """Rows far from a crowd and from each other become centres, however many the crowd is."""
+    rows = jnp.asarray(np.random.default_rng(2).normal(0, 0.5, (400, 2)), jnp.float32)
+    rows = rows.at[7].set(jnp.array([40.0, 40.0])).at[8].set(jnp.array([40.0, -40.0]))
+    keys = jax.random.split(jax.random.key(0), 20)
+    labels = np.asarray(jax.vmap(lambda key: k_means(rows, jnp.ones(400, bool), jnp.int32(3), key, slots=4))(keys))
+    for far in (7, 8):
+        assert ((labels == labels[:, far, None]).sum(axis=1) == 1).all()

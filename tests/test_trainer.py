@@ -14,6 +14,7 @@ from jax.sharding import PartitionSpec
 
 import envs
 from apt_jax import checkpoint
+from apt_jax.bonuses import BONUSES
 from apt_jax.config import PRESETS, Config, HParams
 from apt_jax.descent import has_learned
 from apt_jax.lanes import _spread, lane_bytes, make_program, room, stack_hparams
@@ -92,14 +93,35 @@ def test_every_preset_makes_a_trainer(preset):
     make_trainer(envs.make("grid_world"), envs.load_target("grid_world", "A"), PRESETS[preset][0])
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_every_method_makes_a_program(method):
-    """Traced, not compiled: shapes and dtypes fit, and the state keeps its structure."""
-    trainer = make_trainer(SPACE, TARGET, config(method))
-    state = jax.eval_shape(trainer.init, jax.random.key(0), jax.tree.map(jnp.float32, HParams()))
-    after, _, metrics = jax.eval_shape(trainer.chunk, state, Clock.start(), jax.tree.map(jnp.float32, HParams()))
-    assert after == state
+PAIRS = [
+    name if bonus == "none" else f"{name}+{bonus}"
+    for name, method in METHODS.items()
+    for bonus in BONUSES
+    if method.bonus == "none"
+]
+"""Every curriculum alone and with every bonus."""
+
+
+def assert_makes_a_program(trainer):
+    """Traced, not compiled: shapes and dtypes fit, the state keeps its structure, and nothing is done by the host."""
+    hparams = jax.tree.map(jnp.float32, HParams())
+    state = jax.eval_shape(trainer.init, jax.random.key(0), hparams)
+    jaxpr, (after, _, metrics) = jax.make_jaxpr(trainer.chunk, return_shape=True)(state, Clock.start(), hparams)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert "target_return" in metrics
+    assert "callback" not in str(jaxpr)
+
+
+@pytest.mark.parametrize("method", PAIRS)
+def test_every_curriculum_and_bonus_make_a_program(method):
+    assert_makes_a_program(make_trainer(SPACE, TARGET, config(method)))
+
+
+@pytest.mark.parametrize("space", ["grid_world", "manipulation"])
+@pytest.mark.parametrize("method", ["apt_gen+rnd", "alp_gmm+ride", "goal_gan+icm", "random"])
+def test_every_part_fits_every_space(method, space):
+    cfg = config(method, warmup_steps=1_000)
+    assert_makes_a_program(make_trainer(envs.make(space), envs.load_target(space, "A"), cfg))
 
 
 def test_the_averaged_policy_is_judged():
@@ -201,10 +223,11 @@ def test_a_seed_alone_equals_the_same_seed_among_others(layout):
         assert_lane_equal(several, lane, alone)
 
 
+@pytest.mark.parametrize("layout", ["map", "vmap"])
 @pytest.mark.parametrize("method", ["alp_gmm", "goal_gan", "ride"])
-def test_a_seed_of_another_method_is_the_same_beside_any_other(method):
+def test_a_seed_of_another_method_is_the_same_beside_any_other(method, layout):
     _, hparams = PRESETS["fast"]
-    first, _, _ = run(config(method), [0, 1], hparams=[hparams] * 2)
+    first, _, _ = run(config(method), [0, 1], layout=layout, hparams=[hparams] * 2)
     second, _, _ = run(config(method), [1, 2], hparams=[hparams] * 2)
     assert_lane_equal(first, 1, jax.tree.map(lambda x: x[:1], second))
 

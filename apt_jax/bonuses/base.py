@@ -95,9 +95,9 @@ class Stream(NamedTuple):
     """Episodic returns in the reward that is trained on, as it was when the steps were made: what the next-Q clip needs.
 
     Attributes:
-      episode_return: of the current episodes, bonus included.
-      highest: of the episodes finished since learning began, -inf before the first.  What an untrained network pays during the
-        warm-up would raise it for ever.
+      episode_return: of the current episodes, bonus included; -inf in those that began before learning did: what an untrained
+        network pays would raise `highest` for ever.
+      highest: of the finished episodes, -inf before the first that counts.
     """
 
     episode_return: Float[Array, "S E"]
@@ -106,13 +106,14 @@ class Stream(NamedTuple):
     @classmethod
     def start(cls, shape: tuple[int, int]) -> Stream:
         """Before the first step of S x E environments."""
-        return cls(jnp.zeros(shape), jnp.float32(-jnp.inf))
+        return cls(jnp.full(shape, -jnp.inf), jnp.float32(-jnp.inf))
 
     def step(self, reward: Float[Array, "S E"], done: Bool[Array, "S E"], *, learning: Bool[Array, ""]) -> Stream:
-        """After a step that paid `reward`, bonus included; `learning` says whether an episode that ends with it counts."""
+        """After a step that paid `reward`, bonus included; `learning` says whether an episode that begins after it counts."""
         episode_return = self.episode_return + reward
-        highest = jnp.max(episode_return, initial=-jnp.inf, where=done & learning)
-        return Stream(jnp.where(done, 0.0, episode_return), jnp.maximum(self.highest, highest))
+        highest = jnp.max(episode_return, initial=-jnp.inf, where=done)
+        fresh = jnp.where(learning, 0.0, -jnp.inf)
+        return Stream(jnp.where(done, fresh, episode_return), jnp.maximum(self.highest, highest))
 
     def bounds(self, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """What the next values are clipped to: above by `highest`, unbounded before the first episode.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -32,7 +33,8 @@ EPSILON = 1e-8
 class RndState(NamedTuple):
     """Both networks, the predictor's optimiser, and running statistics, all of them taken when steps are made.
 
-    `filtered` is each environment's forward-filtered return of bonuses, across episodes; `scale` holds its moments.
+    `filtered` is each environment's forward-filtered return of bonuses, across episodes, since the predictor's first update;
+    `scale` holds its moments.  What an untrained predictor pays in the warm-up would outweigh all that it pays later.
     """
 
     target: Any
@@ -83,10 +85,14 @@ def make(space: TaskSpace, config: Config) -> Bonus:
         features = observation_features(space.obs_spec, step.transition.next_obs)
         flat = {name: block.reshape(-1, *block.shape[2:]) for name, block in features.items()}
         state = state._replace(features={name: state.features[name].extend(block) for name, block in flat.items()})
+        learning = has_learned(state.opt_state)
         filtered = forward_filter(state.filtered, error(state, state.predictor, step.transition.next_obs))
-        state = state._replace(filtered=filtered, scale=state.scale.extend(filtered.reshape(-1)))
+        filtered, scale = jax.tree.map(
+            partial(jnp.where, learning), (filtered, state.scale.extend(filtered.reshape(-1))), (state.filtered, state.scale)
+        )
+        state = state._replace(filtered=filtered, scale=scale)
         paid = step.transition.reward + bonus(state, step.transition, hparams)
-        stream = state.stream.step(paid, step.transition.done, learning=has_learned(state.opt_state))
+        stream = state.stream.step(paid, step.transition.done, learning=learning)
         return state._replace(stream=stream), ()
 
     def reward(state: RndState, batch: Batch, hparams: HParams) -> tuple[Float[Array, "..."], Metrics]:

@@ -154,7 +154,8 @@ def k_means(x: Float[Array, "N D"], valid: Bool[Array, "N"], k: Int[Array, ""], 
         count = jnp.sum(near, axis=0)[:, None]
         return jnp.where(count > 0, near.T @ x / jnp.maximum(count, 1.0), centres), None
 
-    start = jnp.zeros((slots, x.shape[1]), x.dtype), jnp.ones(x.shape[0], x.dtype), key
+    nowhere = jnp.full(x.shape[0], jnp.finfo(x.dtype).max)
+    start = jnp.zeros((slots, x.shape[1]), x.dtype), nowhere, key
     (centres, _, _), _ = jax.lax.scan(spread, start, jnp.arange(slots, dtype=jnp.int32))
     centres, _ = jax.lax.scan(move, centres, length=LLOYD_ITERATIONS)
     return jnp.argmin(distances(centres), axis=-1)

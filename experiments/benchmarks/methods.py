@@ -1,6 +1,7 @@
 """What each method costs beside plain DQN: `python -m experiments.benchmarks.methods`.
 
-One seed on Grid-World A, in a chunk that holds everything of a cadence in its share: refreshes, fits, one evaluation.
+One seed on Grid-World A, in chunks of 5,000 steps, which hold refreshes and fits in their share; an evaluation, alike for all,
+comes once in each where the presets have five.
 """
 
 from __future__ import annotations
