@@ -1,7 +1,8 @@
-"""Whole episodes of a fixed policy on given tasks, without learning and without auto-reset."""
+"""Whole episodes of a fixed policy on given tasks, without learning and without auto-reset, and how much tasks differ."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from apt_jax import draws
 from apt_jax.replay import Rollouts, Transition
-from apt_jax.specs import Obs, Params
+from apt_jax.specs import Grid, Obs, Params, Spec, Table, Vector
 from apt_jax.task_space import TaskSpace
 
 Policy = Callable[[Obs, Key[Array, ""]], Int[Array, "n"]]
@@ -76,3 +77,24 @@ def sample_rollouts(w: Params, outcome: Outcome, transitions: Transition, key: K
         length=outcome.length,
         episode_return=outcome.episode_return,
     )
+
+
+def diversity(spec: Spec, w: Params) -> dict[str, Float[Array, ""]]:
+    """How much proposed tasks differ (leaves [n, ...]), per modality.
+
+    `probe_entropy_*` of a grid or table: mean entropy of a category over tasks, as a share of the largest.
+    `probe_spread_*` of a vector: mean standard deviation of a number over tasks, as a share of its range.
+    """
+
+    def entropy(scores: Array, categories: int) -> Array:
+        share = jnp.mean(jax.nn.one_hot(jnp.argmax(scores, axis=-1), categories), axis=0)
+        return jnp.mean(jnp.sum(jax.scipy.special.entr(share), axis=-1)) / math.log(categories)
+
+    metrics = {}
+    for name, modality in spec.items():
+        match modality:
+            case Grid() | Table():
+                metrics[f"probe_entropy_{name}"] = entropy(w[name], modality.categories)
+            case Vector():
+                metrics[f"probe_spread_{name}"] = jnp.mean(jnp.std(w[name], axis=0)) / (modality.high - modality.low)
+    return metrics

@@ -9,7 +9,6 @@ The caller batches over seeds and hyper-parameters and jits (`apt_jax.lanes`).  
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,11 +20,12 @@ from jaxtyping import Array, Float, Int, Key
 from apt_jax import evaluation, learner, replay, workers
 from apt_jax.bonuses.base import Step
 from apt_jax.bonuses.none import no_update as no_bonus_update
+from apt_jax.checks import check_counts, check_sizes, check_space, check_target
 from apt_jax.config import Config, HParams
 from apt_jax.curricula.base import GENERATED, TARGET, Metrics, no_update
 from apt_jax.methods import make_method
 from apt_jax.networks import QNetwork
-from apt_jax.specs import Grid, Obs, Params, Spec, Table, Vector, obs_struct, param_struct
+from apt_jax.specs import Obs, Params
 from apt_jax.task_space import TaskSpace
 
 Carry = TypeVar("Carry")
@@ -245,7 +245,7 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
             metrics |= {
                 "probe_return": jnp.mean(probe.episode_return),
                 "probe_success": jnp.mean(probe.success.astype(jnp.float32)),
-                **diversity(space.param_spec, w),
+                **evaluation.diversity(space.param_spec, w),
                 **{f"probe_{name}": jnp.nanmean(values) for name, values in descriptions.items()},
                 **curriculum.report(state.curriculum, rollouts, hparams),
             }
@@ -269,160 +269,6 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         return learner.greedy(network, params, obs)
 
     return Trainer(space, config, curriculum.generates, init, warmup, chunk, propose, act)
-
-
-def check_counts(config: Config) -> None:
-    """Check that whatever is counted is there at least once.
-
-    Raises:
-      ValueError: the field, its value, and what is allowed.
-    """
-    counts = (
-        "envs_per_source",
-        "refresh_every",
-        "eval_every",
-        "updates_per_step",
-        "n_step",
-        "replay_episodes",
-        "model_batch_size",
-        "rollout_steps",
-        "recent_steps",
-        "value_ensemble",
-        "alp_window",
-        "alp_history",
-        "goal_rollouts",
-        "goal_tasks",
-        "goal_memory",
-        "noise_size",
-        "return_window",
-        "eval_episodes",
-        "probe_tasks",
-    )
-    for name in counts:
-        if getattr(config, name) < 1:
-            raise ValueError(f"{name} must be at least 1, got {getattr(config, name)}")
-
-
-def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> None:
-    """Check that the sizes of a configuration fit together.
-
-    Raises:
-      ValueError: what does not fit, and what is allowed.
-    """
-    steps = sources * config.envs_per_source
-    rounds = config.model_updates_per_step * steps
-    longest = horizon * config.envs_per_source
-    needed = config.recent_steps + longest
-
-    def require(holds: bool, message: str) -> None:
-        if not holds:
-            raise ValueError(message)
-
-    for name in ("warmup_steps", "refresh_every", "eval_every"):
-        size = getattr(config, name)
-        require(
-            size > 0 and size % steps == 0,
-            f"{name} must be a positive multiple of the {steps} environment steps of one iteration, got {size}",
-        )
-    require(
-        config.eval_every % config.refresh_every == 0,
-        f"eval_every must be a multiple of refresh_every={config.refresh_every}, got {config.eval_every}",
-    )
-    require(
-        config.batch_size >= sources and config.batch_size % sources == 0,
-        f"batch_size must be a positive multiple of the {sources} sources, got {config.batch_size}",
-    )
-    drawn = config.success_share * (config.batch_size // sources)
-    require(
-        0.0 <= config.success_share <= 1.0 and (round(drawn) >= 1 or drawn == 0.0),
-        f"success_share must lie in [0, 1] and be 0 or give at least one of {config.batch_size // sources} transitions, "
-        f"got {config.success_share:g}",
-    )
-    require(
-        config.warmup_steps >= horizon * steps,
-        f"warmup_steps must let every environment finish an episode: at least {horizon * steps}, got {config.warmup_steps}",
-    )
-    require(
-        not learns or (1 <= rounds < math.inf and abs(rounds - round(rounds)) < 1e-6),
-        f"model_updates_per_step must give a whole number of updates per iteration of {steps} steps, got {rounds:g}",
-    )
-    require(
-        not learns or (config.model_batch_size >= 2 and config.model_batch_size % sources == 0),
-        f"model_batch_size must be at least 2 and a multiple of the {sources} sources, got {config.model_batch_size}",
-    )
-    require(
-        config.recent_steps >= longest,
-        f"recent_steps must hold one horizon of every environment: at least {longest}, got {config.recent_steps}",
-    )
-    require(
-        config.replay_episodes >= max(config.return_window, config.envs_per_source),
-        f"replay_episodes must be at least return_window={config.return_window} and envs_per_source={config.envs_per_source}, "
-        f"got {config.replay_episodes}",
-    )
-    require(
-        config.replay_steps >= needed and config.replay_steps % config.envs_per_source == 0,
-        f"replay_steps must be a multiple of envs_per_source and hold recent_steps and one more horizon: at least {needed}, "
-        f"got {config.replay_steps}",
-    )
-
-
-def check_space(space: TaskSpace) -> None:
-    """Check that a space draws parameters, and begins with observations, of the shapes and dtypes of its specs.
-
-    Raises:
-      ValueError: which method returns something else, and what is expected.
-    """
-    key = jax.eval_shape(lambda: jax.random.key(0))
-    w = jax.eval_shape(space.sample_uniform, key)
-    task = jax.eval_shape(space.instantiate, param_struct(space.param_spec))
-    _, obs = jax.eval_shape(space.reset, key, task)
-    for name, given, expected in (
-        ("sample_uniform must return", w, param_struct(space.param_spec)),
-        ("reset must return observations like", obs, obs_struct(space.obs_spec)),
-    ):
-        if given != expected:
-            raise ValueError(f"{space.name}.{name} {expected}, got {given}")
-
-
-def check_target(space: TaskSpace, target: Any) -> None:
-    """Check that a target is a task of the shapes and dtypes that the space's tasks have.
-
-    Raises:
-      ValueError: where it differs; or a space with more actions or categories to observe than the replay can store.
-    """
-    sizes = {"num_actions": space.num_actions} | {
-        f"obs_spec[{name!r}].categories": modality.categories
-        for name, modality in space.obs_spec.items()
-        if not isinstance(modality, Vector)
-    }
-    for name, size in sizes.items():
-        if size > 256:
-            raise ValueError(f"{name} must be at most 256, got {size}")
-    expected = jax.eval_shape(space.instantiate, param_struct(space.param_spec))
-    given = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, target))
-    if given != expected:
-        raise ValueError(f"the target must look like a task of {space.name}, {expected}, got {given}")
-
-
-def diversity(spec: Spec, w: Params) -> Metrics:
-    """How much proposed tasks differ (leaves [n, ...]), per modality.
-
-    `probe_entropy_*` of a grid or table: mean entropy of a category over tasks, as a share of the largest.
-    `probe_spread_*` of a vector: mean standard deviation of a number over tasks, as a share of its range.
-    """
-
-    def entropy(scores: Array, categories: int) -> Array:
-        share = jnp.mean(jax.nn.one_hot(jnp.argmax(scores, axis=-1), categories), axis=0)
-        return jnp.mean(jnp.sum(jax.scipy.special.entr(share), axis=-1)) / math.log(categories)
-
-    metrics = {}
-    for name, modality in spec.items():
-        match modality:
-            case Grid() | Table():
-                metrics[f"probe_entropy_{name}"] = entropy(w[name], modality.categories)
-            case Vector():
-                metrics[f"probe_spread_{name}"] = jnp.mean(jnp.std(w[name], axis=0)) / (modality.high - modality.low)
-    return metrics
 
 
 def _sources(rings: replay.Replay, window: int, since: int) -> Metrics:

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"descent", "draws", "registry", "specs"}),
     frozenset({"config", "task_space"}),
-    frozenset({"losses", "networks", "replay"}),
+    frozenset({"checks", "losses", "networks", "replay"}),
     frozenset({"bonuses", "curricula", "learner"}),
     frozenset({"evaluation", "methods", "workers"}),
     frozenset({"trainer"}),

@@ -17,9 +17,10 @@ from apt_jax import checkpoint
 from apt_jax.bonuses import BONUSES
 from apt_jax.config import PRESETS, Config, HParams
 from apt_jax.descent import has_learned
+from apt_jax.evaluation import diversity
 from apt_jax.lanes import _spread, lane_bytes, make_program, room, stack_hparams
 from apt_jax.methods import METHODS, Method, parse_method
-from apt_jax.trainer import Clock, diversity, make_trainer
+from apt_jax.trainer import Clock, make_trainer
 from tests.corridor import Corridor
 
 SPACE = Corridor()
