@@ -22,7 +22,7 @@ from experiments import processes, runtime
 from experiments.errors import UsageError
 from experiments.programs import Programs
 from experiments.run_dir import RunDir
-from experiments.settings import Experiment
+from experiments.settings import Experiment, target_text
 
 _PROPOSE_STREAM = 1_000_003
 """Sampling tasks for pictures draws from a stream of its own."""
@@ -52,6 +52,7 @@ class Runner:
         except ValueError as error:
             raise UsageError(str(error)) from error
         self._keys, self._hparams = lane_inputs(experiment)
+        self._target = target_text(experiment)
         self._propose = jax.jit(jax.vmap(trainer.propose, in_axes=(0, 0, None, 0)), static_argnums=2)
         self._states: TrainState
         self._clock: Clock
@@ -73,7 +74,8 @@ class Runner:
     def init(self) -> float:
         """Fresh states, before anything else; returns the seconds that compiling took."""
         began = time.monotonic()
-        init = self.programs.compile("init", self._program.init, self._keys, self._hparams)
+        # The target is data from here on: the other programs serve every target of the space.
+        init = self.programs.compile("init", self._program.init, self._keys, self._hparams, holding=self._target)
         seconds = time.monotonic() - began
         self._states = init(self._keys, self._hparams)
         self._clock = jax.device_put(Clock.start(), NamedSharding(self._mesh, PartitionSpec()))

@@ -91,8 +91,7 @@ def kept_programs(experiment: Experiment, session: Session, space: envs.Benchmar
     """Programs are kept for one process whose task space and method come with this project: then all sources are known."""
     if session.distributed or experiment.plugins or not type(space).__module__.startswith(f"{envs.__name__}."):
         return Programs()
-    target = experiment.target_file.read_bytes() if experiment.target_file else experiment.target
-    return Programs.of(experiment.space, target, experiment.config, len(experiment.lanes), session.layout, session.at_once)
+    return Programs.of(experiment.space, experiment.config, len(experiment.lanes), session.layout, session.at_once)
 
 
 def open_sinks(experiment: Experiment, session: Session, start: int) -> list[Sink]:

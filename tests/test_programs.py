@@ -16,7 +16,7 @@ import envs
 from apt_jax.config import Config
 from experiments import programs
 from experiments.programs import Programs
-from experiments.settings import Experiment, Session
+from experiments.settings import Experiment, Session, target_text
 from experiments.train import kept_programs
 from tests.corridor import Corridor
 
@@ -78,6 +78,22 @@ def test_what_differs_in_anything_is_another_program(tmp_path, name, made_of, ar
         assert (result.shape, result.dtype, result.sharding) == (expected.shape, expected.dtype, expected.sharding)
 
 
+def test_what_a_function_holds_makes_it_another_program(tmp_path):
+    for loaded in (0, 1):
+        own = Programs(tmp_path)
+        for target in ("A", "B"):
+            own.compile("double", Doubling().jitted, state(), holding=target)
+        assert own.loaded == 2 * loaded
+
+
+def test_a_target_file_is_known_by_its_text(tmp_path):
+    experiment = Experiment(target_file=tmp_path / "own.txt")
+    for text in ("first", "second"):
+        experiment.target_file.write_text(text)
+        assert target_text(experiment) == text
+    assert target_text(Experiment(target="B")) == "B"
+
+
 def test_a_damaged_file_is_made_anew(tmp_path):
     Programs(tmp_path).compile("double", Doubling().jitted, state())
     (file,) = tmp_path.iterdir()
@@ -120,15 +136,11 @@ def kept(experiment: Experiment, session: Session, space: str = "grid_world") ->
 
 def test_a_run_finds_what_another_of_its_kind_has_compiled(cache):
     experiment, session = Experiment(), Session(Path("run"))
-    own = dataclasses.replace(experiment, target_file=cache / "own.txt")
-    own.target_file.write_text("first")
     kinds = [
         (experiment, session),
         (dataclasses.replace(experiment, seeds=(0, 1)), session),
         (dataclasses.replace(experiment, config=Config(batch_size=64)), session),
-        (dataclasses.replace(experiment, target="B"), session),
         (dataclasses.replace(experiment, space="manipulation"), session),
-        (own, session),
         (experiment, dataclasses.replace(session, layout="vmap")),
         (experiment, dataclasses.replace(session, at_once=2)),
     ]
@@ -136,8 +148,7 @@ def test_a_run_finds_what_another_of_its_kind_has_compiled(cache):
     assert all(found(kept(*kind)) for kind in kinds)
     assert found(kept(dataclasses.replace(experiment, seeds=(5, 6, 7, 8, 9), env_steps=20_000), session))
     assert found(kept(experiment, Session(Path("another run"), resume=True)))
-    own.target_file.write_text("second")
-    assert not found(kept(own, session))
+    assert found(kept(dataclasses.replace(experiment, target="B"), session))
 
 
 def test_what_has_sources_of_others_several_processes_or_no_cache_is_not_kept(cache, monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -73,3 +75,18 @@ def test_seeds_that_do_not_fit_take_turns(experiment, monkeypatch, tmp_path):
         assert runner.env_steps == 60
         np.testing.assert_array_equal(runner.advance()["td_loss"], expected["td_loss"])
         assert all(leaf.shape[0] == 5 for leaf in jax.tree.leaves(runner.policies()))
+
+
+def test_only_init_is_compiled_for_another_target(experiment, tmp_path):
+    """And the other programs, loaded, do for it what its own would."""
+    start(*experiment, Programs(tmp_path))
+    other = make_trainer(Corridor(), np.int32(3), experiment[0].config)
+    loading = start(dataclasses.replace(experiment[0], target="nearer"), other, Programs(tmp_path))
+    assert (loading.programs.loaded, loading.programs.compiled) == (2, 1)
+    alone = start(experiment[0], other)
+    for runner in (loading, alone):
+        runner.warmup()
+    expected = alone.advance()
+    for name, values in loading.advance().items():
+        np.testing.assert_array_equal(values, expected[name])
+    assert np.any(expected["behaviour_success"] > 0)
