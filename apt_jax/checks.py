@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from apt_jax.config import Config
 from apt_jax.specs import Vector, obs_struct, param_struct
-from apt_jax.task_space import TaskSpace
+from apt_jax.task_space import TaskSpace, task_struct
 
 
 def check_counts(config: Config) -> None:
@@ -112,12 +112,20 @@ def check_space(space: TaskSpace) -> None:
     """Check that a space draws parameters, and begins with observations, of the shapes and dtypes of its specs.
 
     Raises:
-      ValueError: which method returns something else, and what is expected.
+      ValueError: which method returns something else, and what is expected; or more actions, or categories to observe, than the
+        replay can store.
     """
+    sizes = {"num_actions": space.num_actions} | {
+        f"obs_spec[{name!r}].categories": modality.categories
+        for name, modality in space.obs_spec.items()
+        if not isinstance(modality, Vector)
+    }
+    for name, size in sizes.items():
+        if size > 256:
+            raise ValueError(f"{name} must be at most 256, got {size}")
     key = jax.eval_shape(lambda: jax.random.key(0))
     w = jax.eval_shape(space.sample_uniform, key)
-    task = jax.eval_shape(space.instantiate, param_struct(space.param_spec))
-    _, obs = jax.eval_shape(space.reset, key, task)
+    _, obs = jax.eval_shape(space.reset, key, task_struct(space))
     for name, given, expected in (
         ("sample_uniform must return", w, param_struct(space.param_spec)),
         ("reset must return observations like", obs, obs_struct(space.obs_spec)),
@@ -130,17 +138,9 @@ def check_target(space: TaskSpace, target: Any) -> None:
     """Check that a target is a task of the shapes and dtypes that the space's tasks have.
 
     Raises:
-      ValueError: where it differs; or a space with more actions or categories to observe than the replay can store.
+      ValueError: where it differs.
     """
-    sizes = {"num_actions": space.num_actions} | {
-        f"obs_spec[{name!r}].categories": modality.categories
-        for name, modality in space.obs_spec.items()
-        if not isinstance(modality, Vector)
-    }
-    for name, size in sizes.items():
-        if size > 256:
-            raise ValueError(f"{name} must be at most 256, got {size}")
-    expected = jax.eval_shape(space.instantiate, param_struct(space.param_spec))
+    expected = task_struct(space)
     given = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, target))
     if given != expected:
         raise ValueError(f"the target must look like a task of {space.name}, {expected}, got {given}")

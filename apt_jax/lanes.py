@@ -1,8 +1,8 @@
-"""Many seeds and hyper-parameters as lanes of one compiled program.
+"""Many seeds, targets and hyper-parameters as lanes of one compiled program.
 
-A lane is one (key, HParams).  The functions of `apt_jax.trainer` know nothing of lanes; here they are batched, sharded over
-devices, also those of other hosts, and jitted.  The program has no collectives, so no device ever waits for another (one CPU
-device that waits for another longer than a minute ends the process: XLA takes it for a deadlock).
+A lane is one (key, target, HParams).  The functions of `apt_jax.trainer` know nothing of lanes; here they are batched, sharded
+over devices, also those of other hosts, and jitted.  The program has no collectives, so no device ever waits for another (one
+CPU device that waits for another longer than a minute ends the process: XLA takes it for a deadlock).
 
 Within a device, lanes run side by side ("vmap", for accelerators) or one after another ("map", for CPUs: with a device per core
 both take as long, and "map" computes in every lane what it computes alone; BENCHMARKS.md, "Many seeds").
@@ -23,6 +23,7 @@ from jaxtyping import Array, Int, Key
 
 from apt_jax.config import HParams, check_hparams
 from apt_jax.curricula.base import Metrics
+from apt_jax.task_space import task_struct
 from apt_jax.trainer import Clock, Trainer, TrainState
 from apt_jax.turns import Turns
 
@@ -35,12 +36,12 @@ class Program(NamedTuple):
     States and metrics hold at least L lanes: the last is repeated up to a multiple of the devices.
 
     Attributes:
-      init: `init(keys, hparams) -> states`, for keys [L] and hparams with leaves [L].
+      init: `init(keys, targets, hparams) -> states`, for keys [L], and targets and hparams with leaves [L, ...].
       warmup: `warmup(states, clock, hparams) -> (states, clock)`.
       chunk: `chunk(states, clock, hparams) -> (states, clock, metrics)`.
     """
 
-    init: Callable[[Key[Array, "L"], HParams], TrainState]
+    init: Callable[[Key[Array, "L"], Any, HParams], TrainState]
     warmup: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock]]
     chunk: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock, Metrics]]
 
@@ -54,6 +55,11 @@ def stack_hparams(hparams: Sequence[HParams]) -> HParams:
     for lane in hparams:
         check_hparams(lane)
     return jax.tree.map(lambda *leaves: np.asarray(leaves, np.float32), *hparams)
+
+
+def stack_targets(targets: Sequence[Any]) -> Any:
+    """Target tasks of single lanes, all of one space, as one with leaves [L, ...]."""
+    return jax.tree.map(lambda *leaves: np.stack([jnp.asarray(x) for x in leaves]), *targets)
 
 
 def make_program(
@@ -116,10 +122,10 @@ def make_program(
             return sharded(_vmap(function, in_specs, out_specs), in_specs, out_specs)
         return sharded(_map(function, in_specs, out_specs, width=width), in_specs, out_specs)
 
-    def init_lanes(keys: Key[Array, "L"], hparams: HParams) -> TrainState:
-        return jax.lax.map(lambda lane: trainer.init(*lane), (keys, hparams), batch_size=None if width == 1 else width)
+    def init_lanes(keys: Key[Array, "L"], targets: Any, hparams: HParams) -> TrainState:
+        return jax.lax.map(lambda lane: trainer.init(*lane), (keys, targets, hparams), batch_size=None if width == 1 else width)
 
-    init = sharded(init_lanes, (lane, lane), lane)
+    init = sharded(init_lanes, (lane, lane, lane), lane)
     warmup = over_lanes(trainer.warmup, (lane, shared, lane), (lane, shared))
     chunk = over_lanes(trainer.chunk, (lane, shared, lane), (lane, shared, lane))
 
@@ -127,8 +133,8 @@ def make_program(
     simpler = {"xla_cpu_use_fusion_emitters": False} if used[0].platform == "cpu" else {}
 
     @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0, **simpler})
-    def init_all(keys: Key[Array, "L"], hparams: HParams) -> TrainState:
-        return init(pad(keys), pad(hparams))
+    def init_all(keys: Key[Array, "L"], targets: Any, hparams: HParams) -> TrainState:
+        return init(pad(keys), pad(targets), pad(hparams))
 
     @partial(jax.jit, donate_argnums=0, compiler_options=simpler)
     def warmup_all(states: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock]:
@@ -144,7 +150,8 @@ def make_program(
 def lane_bytes(trainer: Trainer) -> int:
     """The size of one lane's state, most of it the replay."""
     hparams = jax.tree.map(np.float32, HParams())
-    state = jax.eval_shape(trainer.init, jax.eval_shape(lambda: jax.random.key(0)), hparams)
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    state = jax.eval_shape(trainer.init, key, task_struct(trainer.space), hparams)
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
 
 

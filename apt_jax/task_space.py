@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
+import jax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from apt_jax.specs import Obs, Params, Spec
+from apt_jax.specs import Obs, Params, Spec, param_struct
 
 
 class StepOutput(NamedTuple):
@@ -70,3 +71,8 @@ class TaskSpace(Protocol):
         NaN says "not defined for this task"; means over tasks skip it.
         """
         ...
+
+
+def task_struct(space: TaskSpace) -> Any:
+    """The shapes and dtypes of a space's tasks, its targets included."""
+    return jax.eval_shape(space.instantiate, param_struct(space.param_spec))

@@ -67,7 +67,8 @@ class Trainer(NamedTuple):
       space: the task space.
       config: the static configuration.
       generates: whether there is a generated source.
-      init: `init(key, hparams) -> TrainState`; consumes `key`.
+      init: `init(key, target, hparams) -> TrainState` for a target task of the space; consumes `key`.  Raises a `ValueError`
+        while it is traced for a target that is not like the space's tasks.
       warmup: `warmup(state, clock, hparams) -> (state, clock)`: `Config.warmup_steps` of random actions, no updates.
       chunk: `chunk(state, clock, hparams) -> (state, clock, metrics)`: `Config.eval_every` steps, then an evaluation.
       propose: `propose(state, key, n, hparams) -> w`: tasks the curriculum would generate now, leaves [n, ...]; consumes `key`.
@@ -77,25 +78,24 @@ class Trainer(NamedTuple):
     space: TaskSpace
     config: Config
     generates: bool
-    init: Callable[[Key[Array, ""], HParams], TrainState]
+    init: Callable[[Key[Array, ""], Any, HParams], TrainState]
     warmup: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock]]
     chunk: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock, Metrics]]
     propose: Callable[[TrainState, Key[Array, ""], int, HParams], Params]
     act: Callable[[Any, Obs], Int[Array, "..."]]
 
 
-def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
-    """The trainer of a configuration for one target task of `space`.
+def make_trainer(space: TaskSpace, config: Config) -> Trainer:
+    """The trainer of a configuration for the targets of `space`.
 
     Raises:
-      ValueError: an unknown method, sizes that do not fit together (what, and what is allowed), a space or target that
-        is not what its specs say, or JAX set to 64 bits.
+      ValueError: an unknown method, sizes that do not fit together (what, and what is allowed), a space that is not what its
+        specs say, or JAX set to 64 bits.
     """
     if jax.dtypes.canonicalize_dtype(float) != jnp.float32:
         raise ValueError("apt_jax computes with 32 bits: unset jax_enable_x64 (JAX_ENABLE_X64)")
     check_counts(config)
     check_space(space)
-    check_target(space, target)
     curriculum, bonus = make_method(space, config)
     sources = 2 if curriculum.generates else 1
     learns = curriculum.update is not no_update or bonus.update is not no_bonus_update
@@ -108,7 +108,8 @@ def make_trainer(space: TaskSpace, target: Any, config: Config) -> Trainer:
         w = curriculum.propose(state, key, envs, hparams) if curriculum.generates else None
         return workers.assign(space, target, w, envs)
 
-    def init(key: Key[Array, ""], hparams: HParams) -> TrainState:
+    def init(key: Key[Array, ""], target: Any, hparams: HParams) -> TrainState:
+        check_target(space, target)
         key, key_eval, key_learner, key_curriculum, key_assign, key_start, key_bonus = jax.random.split(key, 7)
         learner_state = learner.init(network, key_learner)
         curriculum_state = curriculum.init(key_curriculum, hparams)

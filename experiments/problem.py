@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import envs
+from apt_jax.checks import check_target
 from apt_jax.config import Config
 from apt_jax.trainer import Trainer, make_trainer
 from experiments.errors import UsageError
@@ -47,7 +48,8 @@ def make_problem(experiment: Experiment) -> Problem:
     target = load_target(experiment.space, experiment.target, experiment.target_file)
     space = make_space(experiment.space)
     try:
-        problem = Problem(space, target, make_trainer(space, target, experiment.config))
+        problem = Problem(space, target, make_trainer(space, experiment.config))
+        check_target(space, target)
     except ValueError as error:
         raise UsageError(str(error)) from error
     check_env_steps(experiment.env_steps, experiment.config)

@@ -55,19 +55,18 @@ class Programs:
         setting = (sorted(jax.config.values.items()), [os.environ.get(name) for name in _FLAGS])
         return cls(Path(directory) / "programs", repr((parts, digest(SOURCES), setting, machine(), runtime.versions())))
 
-    def compile(self, name: str, function: Callable[..., Any], *args: Any, holding: object = None) -> Callable[..., Any]:
+    def compile(self, name: str, function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
         """What `function`, jitted, is for arguments of these types.
 
         Args:
           name: tells apart functions that are made of the same and have the same arguments.
-          holding: what this function alone holds besides, by its `repr`.
         """
         wrapped = cast(jax.stages.Wrapped, function)
         if self._folder is None:
             self.compiled += 1
             return wrapped.lower(*args).compile()
         leaves, structure = jax.tree.flatten(args)
-        key = repr((self._made_of, name, holding, str(structure), [_type(leaf) for leaf in leaves]))
+        key = repr((self._made_of, name, str(structure), [_type(leaf) for leaf in leaves]))
         file = self._folder / f"{name}-{sha256(key.encode()).hexdigest()}"
         if (kept := _load(file)) is not None:
             self.loaded += 1

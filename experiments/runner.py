@@ -14,15 +14,16 @@ from jaxtyping import Array, Float, Key
 
 from apt_jax import checkpoint
 from apt_jax.config import HParams
-from apt_jax.lanes import Layout, lane_bytes, make_program, room, stack_hparams
+from apt_jax.lanes import Layout, lane_bytes, make_program, room, stack_hparams, stack_targets
 from apt_jax.specs import Params
+from apt_jax.task_space import task_struct
 from apt_jax.trainer import Clock, Trainer, TrainState
 from apt_jax.turns import Turns
 from experiments import processes, runtime
 from experiments.errors import UsageError
 from experiments.programs import Programs
 from experiments.run_dir import RunDir
-from experiments.settings import Experiment, target_text
+from experiments.settings import Experiment
 
 _PROPOSE_STREAM = 1_000_003
 """Sampling tasks for pictures draws from a stream of its own."""
@@ -38,6 +39,7 @@ class Runner:
     def __init__(
         self,
         trainer: Trainer,
+        target: Any,
         experiment: Experiment,
         layout: Layout,
         at_once: int | None = None,
@@ -52,7 +54,7 @@ class Runner:
         except ValueError as error:
             raise UsageError(str(error)) from error
         self._keys, self._hparams = lane_inputs(experiment)
-        self._target = target_text(experiment)
+        self._targets = stack_targets([target] * self._lanes)
         self._propose = jax.jit(jax.vmap(trainer.propose, in_axes=(0, 0, None, 0)), static_argnums=2)
         self._states: TrainState
         self._clock: Clock
@@ -74,10 +76,10 @@ class Runner:
     def init(self) -> float:
         """Fresh states, before anything else; returns the seconds that compiling took."""
         began = time.monotonic()
-        # The target is data from here on: the other programs serve every target of the space.
-        init = self.programs.compile("init", self._program.init, self._keys, self._hparams, holding=self._target)
+        args = self._keys, self._targets, self._hparams
+        init = self.programs.compile("init", self._program.init, *args)
         seconds = time.monotonic() - began
-        self._states = init(self._keys, self._hparams)
+        self._states = init(*args)
         self._clock = jax.device_put(Clock.start(), NamedSharding(self._mesh, PartitionSpec()))
         return seconds
 
@@ -168,7 +170,8 @@ def load_states(
     Raises:
       UsageError: there is none, or it cannot be read.
     """
-    states, clock = jax.eval_shape(jax.vmap(trainer.init), keys, hparams), jax.eval_shape(Clock.start)
+    init = jax.vmap(trainer.init, in_axes=(0, None, 0))
+    states, clock = jax.eval_shape(init, keys, task_struct(trainer.space), hparams), jax.eval_shape(Clock.start)
     try:
         rows = checkpoint.rows(directory)
         by_lane, shared = NamedSharding(_even(mesh, rows), PartitionSpec("lane")), NamedSharding(mesh, PartitionSpec())

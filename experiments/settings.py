@@ -289,15 +289,6 @@ def target_name(experiment: Experiment) -> str:
     return experiment.target_file.name if experiment.target_file else experiment.target
 
 
-def target_text(experiment: Experiment) -> str:
-    """What tells the target from the space's others: the text of its file, or its name.
-
-    Raises:
-      UsageError: the file cannot be read.
-    """
-    return _read(experiment.target_file) if experiment.target_file else experiment.target
-
-
 def _read(file: Path) -> str:
     """The text of a file; raises a `UsageError` where there is none."""
     try:

@@ -53,9 +53,8 @@ def train(experiment: Experiment, session: Session) -> int:
     problem = make_problem(experiment)
     check_installed(session.sinks)
     processes.check_same(repr((experiment, dataclasses.replace(session, process_id=None))))
-    runner = Runner(
-        problem.trainer, experiment, session.layout, session.at_once, kept_programs(experiment, session, problem.space)
-    )
+    programs = kept_programs(experiment, session, problem.space)
+    runner = Runner(problem.trainer, problem.target, experiment, session.layout, session.at_once, programs)
     run = RunDir(session.run_dir)
     if session.resume and processes.from_first(lambda: is_complete(run.path, experiment)):
         if processes.is_first():

@@ -154,8 +154,8 @@ def test_numbers_in_tables(value, text):
 def test_each_preset_fits_the_quick_sizes():
     for preset in training_step.Args().presets:
         for name in envs.SPACES:
-            space, target, config, _ = _measure.load_problem(preset, space=name, **_measure.QUICK)
-            make_trainer(space, target, config)
+            problem = _measure.load_problem(preset, space=name, **_measure.QUICK)
+            make_trainer(problem.space, problem.config)
 
 
 COUNTDOWN = JaxWorld(
@@ -264,7 +264,7 @@ def test_every_size_of_growth_fits_the_preset():
     for axis, sizes in growth.AXES.items():
         for size in sizes:
             problem = growth.load_problem(growth.at(axis, size), quick=True)
-            make_trainer(problem.space, problem.target, problem.config)
+            make_trainer(problem.space, problem.config)
 
 
 @pytest.fixture(scope="module")

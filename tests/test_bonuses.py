@@ -248,10 +248,10 @@ LOCK_HPARAMS = HParams(
 def test_bonuses_open_a_lock_that_plain_dqn_does_not(method):
     """One sequence of ten in 59,049 pays: over five seeds, plain DQN never meets it in 7,500 steps."""
     config = Config(**{**vars(LOCK_CONFIG), "method": method})
-    program = make_program(make_trainer(Lock(), np.int32(0), config), 5)
+    program = make_program(make_trainer(Lock(), config), 5)
     hparams = LOCK_HPARAMS.replace(bonus_learning_rate=1e-4) if method == "rnd" else LOCK_HPARAMS
     lanes = stack_hparams([hparams] * 5)
-    states = program.init(jax.vmap(jax.random.key)(np.arange(5)), lanes)
+    states = program.init(jax.vmap(jax.random.key)(np.arange(5)), np.zeros(5, np.int32), lanes)
     states, clock = program.warmup(states, Clock.start(), lanes)
     opened = np.zeros(5, bool)
     for _ in range(7):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from apt_jax.config import Config, HParams
-from apt_jax.lanes import make_program, stack_hparams
+from apt_jax.lanes import make_program, stack_hparams, stack_targets
 from apt_jax.specs import Vector
 from apt_jax.trainer import Clock, make_trainer
 from tests.corridor import LENGTH, Corridor
@@ -124,7 +124,7 @@ def states():
 
 @pytest.fixture(scope="module")
 def chunk(states):
-    return program().chunk.lower(states, jax.eval_shape(Clock.start), lanes()[1]).compile()
+    return program().chunk.lower(states, jax.eval_shape(Clock.start), lanes()[-1]).compile()
 
 
 @pytest.fixture(scope="module")
@@ -133,11 +133,12 @@ def text(chunk):
 
 
 def program(count=2, **options):
-    return make_program(make_trainer(PairedCorridor(), np.int32(7), CONFIG), count, **options)
+    return make_program(make_trainer(PairedCorridor(), CONFIG), count, **options)
 
 
 def lanes(count=2):
-    return jax.eval_shape(lambda: jax.vmap(jax.random.key)(np.arange(count))), stack_hparams([HParams()] * count)
+    keys = jax.eval_shape(lambda: jax.vmap(jax.random.key)(np.arange(count)))
+    return keys, stack_targets([np.int32(7)] * count), stack_hparams([HParams()] * count)
 
 
 def test_no_ring_is_copied_in_the_loop(text):
@@ -153,7 +154,7 @@ def test_there_is_no_room_for_a_copy_of_a_ring(chunk, states):
 def test_lanes_side_by_side_copy_no_ring(states):
     """Two on one device, as accelerators have them."""
     together = program(layout="vmap", devices=jax.devices()[:1])
-    chunk = together.chunk.lower(states, jax.eval_shape(Clock.start), lanes()[1]).compile()
+    chunk = together.chunk.lower(states, jax.eval_shape(Clock.start), lanes()[-1]).compile()
     assert copies(chunk.as_text(), COLUMNS) == []
     ring = min(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(states.replay.transitions))
     assert chunk.memory_analysis().temp_size_in_bytes < ring
@@ -163,7 +164,7 @@ def test_lanes_that_take_turns_have_room_for_one_besides():
     """Three on one device: the one at work is taken out and put back."""
     turns = program(3, layout="map", devices=jax.devices()[:1])
     states = jax.eval_shape(turns.init, *lanes(3))
-    memory = turns.chunk.lower(states, jax.eval_shape(Clock.start), lanes(3)[1]).compile().memory_analysis()
+    memory = turns.chunk.lower(states, jax.eval_shape(Clock.start), lanes(3)[-1]).compile().memory_analysis()
     one = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(states.replay)) / 3
     assert memory.temp_size_in_bytes < 1.2 * one
 

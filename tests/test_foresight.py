@@ -33,9 +33,9 @@ def test_v2_is_asked_before_the_tasks_are_played(monkeypatch):
     """One period on the corridor, where training is a function that writes known episodes and forgets all it knew."""
     sizes = {"envs_per_source": 1, "replay_steps": 60, "recent_steps": 40, "replay_episodes": 8, "return_window": 8}
     config = Config(method="apt_gen", value_ensemble=2, **sizes)
-    trainer = make_trainer(Corridor(), np.int32(7), config)
+    trainer = make_trainer(Corridor(), config)
     lanes = stack_hparams([HParams(pessimism=0.0, epsilon_end=0.0), HParams(pessimism=1.0, epsilon_end=0.0)])
-    states = jax.jit(jax.vmap(trainer.init))(jax.random.split(jax.random.key(0), 2), lanes)
+    states = jax.jit(jax.vmap(trainer.init))(jax.random.split(jax.random.key(0), 2), np.full(2, 7, np.int32), lanes)
     models = states.curriculum.models
     says = jnp.tile(jnp.array([0.25, 0.75]), (2, 1))[..., None]  # each network of each lane the same of every task
     models = models._replace(return_value=constant(models.return_value, says))

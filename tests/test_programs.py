@@ -16,7 +16,7 @@ import envs
 from apt_jax.config import Config
 from experiments import programs
 from experiments.programs import Programs
-from experiments.settings import Experiment, Session, target_text
+from experiments.settings import Experiment, Session
 from experiments.train import kept_programs
 from tests.corridor import Corridor
 
@@ -76,22 +76,6 @@ def test_what_differs_in_anything_is_another_program(tmp_path, name, made_of, ar
         result = own.compile(name, Doubling().jitted, state(**argument))(state(**argument))["x"]
         assert own.loaded == loaded
         assert (result.shape, result.dtype, result.sharding) == (expected.shape, expected.dtype, expected.sharding)
-
-
-def test_what_a_function_holds_makes_it_another_program(tmp_path):
-    for loaded in (0, 1):
-        own = Programs(tmp_path)
-        for target in ("A", "B"):
-            own.compile("double", Doubling().jitted, state(), holding=target)
-        assert own.loaded == 2 * loaded
-
-
-def test_a_target_file_is_known_by_its_text(tmp_path):
-    experiment = Experiment(target_file=tmp_path / "own.txt")
-    for text in ("first", "second"):
-        experiment.target_file.write_text(text)
-        assert target_text(experiment) == text
-    assert target_text(Experiment(target="B")) == "B"
 
 
 def test_a_damaged_file_is_made_anew(tmp_path):

@@ -12,6 +12,7 @@ import pytest
 import envs
 from apt_jax.config import PRESETS, HParams
 from apt_jax.lanes import stack_hparams
+from apt_jax.task_space import task_struct
 from apt_jax.trainer import make_trainer
 from experiments import rungs, settings, train
 from experiments.errors import UsageError
@@ -50,10 +51,10 @@ def test_table_and_correlations():
 
 def test_models_of_every_lane_judge_every_task():
     config = dataclasses.replace(PRESETS["fast"][0], replay_steps=50_000)
-    trainer = make_trainer(envs.make("grid_world"), envs.load_target("grid_world", "A"), config)
+    trainer = make_trainer(envs.make("grid_world"), config)
     hparams = stack_hparams([HParams()] * 2)
     keys = jax.eval_shape(lambda: jax.vmap(jax.random.key)(jnp.arange(2)))
-    states = jax.eval_shape(jax.vmap(trainer.init), keys, hparams)
+    states = jax.eval_shape(jax.vmap(trainer.init, (0, None, 0)), keys, task_struct(trainer.space), hparams)
     w = rungs.choose(LADDER, 3, seed=1)
     policies = states.learner.target_params
     judged = jax.eval_shape(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
@@ -35,12 +33,12 @@ def experiment():
         probe_tasks=2,
         return_window=8,
     )
-    return Experiment(seeds=(3, 0, 4, 1, 2), config=config), make_trainer(Corridor(), np.int32(7), config)
+    return Experiment(seeds=(3, 0, 4, 1, 2), config=config), make_trainer(Corridor(), config)
 
 
-def start(experiment, trainer, programs=None):
+def start(experiment, trainer, programs=None, *, target=7):
     """A runner that is compiled, but has not run."""
-    runner = Runner(trainer, experiment, "map", programs=programs)
+    runner = Runner(trainer, np.int32(target), experiment, "map", programs=programs)
     runner.init()
     runner.compile()
     return runner
@@ -77,13 +75,11 @@ def test_seeds_that_do_not_fit_take_turns(experiment, monkeypatch, tmp_path):
         assert all(leaf.shape[0] == 5 for leaf in jax.tree.leaves(runner.policies()))
 
 
-def test_only_init_is_compiled_for_another_target(experiment, tmp_path):
-    """And the other programs, loaded, do for it what its own would."""
+def test_programs_serve_every_target(experiment, tmp_path):
     start(*experiment, Programs(tmp_path))
-    other = make_trainer(Corridor(), np.int32(3), experiment[0].config)
-    loading = start(dataclasses.replace(experiment[0], target="nearer"), other, Programs(tmp_path))
-    assert (loading.programs.loaded, loading.programs.compiled) == (2, 1)
-    alone = start(experiment[0], other)
+    loading = start(*experiment, Programs(tmp_path), target=3)
+    assert (loading.programs.loaded, loading.programs.compiled) == (3, 0)
+    alone = start(*experiment, target=3)
     for runner in (loading, alone):
         runner.warmup()
     expected = alone.advance()

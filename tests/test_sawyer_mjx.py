@@ -208,8 +208,8 @@ class TestOption:
 def test_the_arm_in_mjx_goes_through_the_whole_program():
     """Traced, not compiled."""
     config, hparams = PRESETS["fast"]
-    trainer = make_trainer(envs.make("manipulation_sawyer"), envs.load_target("manipulation_sawyer", "B"), config)
-    start = jax.eval_shape(trainer.init, jax.random.key(0), hparams)
+    trainer = make_trainer(envs.make("manipulation_sawyer"), config)
+    start = jax.eval_shape(trainer.init, jax.random.key(0), envs.load_target("manipulation_sawyer", "B"), hparams)
     warm = jax.eval_shape(trainer.warmup, start, Clock.start(), hparams)
     assert jax.eval_shape(trainer.chunk, *warm, hparams)[:2] == warm
     assert warm[0] == start

@@ -60,8 +60,8 @@ def sides(request):
     config, hparams = PRESETS[preset]
     sizes = {"warmup_steps": 1_000, "replay_steps": 2_000, "recent_steps": 500, "model_batch_size": 32}
     config = dataclasses.replace(config, judge_parts=judge_parts, **sizes)
-    trainer = make_trainer(SPACE, envs.load_target("grid_world", "A"), config)
-    state = jax.jit(trainer.init)(jax.random.key(0), hparams)
+    trainer = make_trainer(SPACE, config)
+    state = jax.jit(trainer.init)(jax.random.key(0), envs.load_target("grid_world", "A"), hparams)
     state, clock = jax.jit(trainer.warmup)(state, Clock.start(), hparams)
     # An average network of its own shows which of the two is asked for what, and marked episodes which are drawn.
     average = learner.init(NETWORK, jax.random.key(1)).params

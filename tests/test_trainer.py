@@ -18,8 +18,9 @@ from apt_jax.bonuses import BONUSES
 from apt_jax.config import PRESETS, Config, HParams
 from apt_jax.descent import has_learned
 from apt_jax.evaluation import diversity
-from apt_jax.lanes import _spread, lane_bytes, make_program, room, stack_hparams
+from apt_jax.lanes import _spread, lane_bytes, make_program, room, stack_hparams, stack_targets
 from apt_jax.methods import METHODS, Method, parse_method
+from apt_jax.task_space import task_struct
 from apt_jax.trainer import Clock, make_trainer
 from tests.corridor import Corridor
 
@@ -58,17 +59,22 @@ def config(method: str, **changes) -> Config:
     return dataclasses.replace(CONFIG, method=method, **SWITCHES | changes)
 
 
+def targets(lanes):
+    """The same for every lane."""
+    return stack_targets([TARGET] * lanes)
+
+
 @functools.cache
 def program(cfg, lanes, layout):
     """Compiled once for all tests."""
-    return make_program(make_trainer(SPACE, TARGET, cfg), lanes, layout=layout)
+    return make_program(make_trainer(SPACE, cfg), lanes, layout=layout)
 
 
-def run(cfg, seeds, chunks=2, layout="map", hparams=None):
+def run(cfg, seeds, chunks=2, layout="map", hparams=None, goals=None):
     """States and metrics of every chunk for some seeds."""
     compiled = program(cfg, len(seeds), layout)
     lanes = stack_hparams(hparams or [HParams()] * len(seeds))
-    states = compiled.init(jax.vmap(jax.random.key)(np.array(seeds)), lanes)
+    states = compiled.init(jax.vmap(jax.random.key)(np.array(seeds)), targets(len(seeds)) if goals is None else stack_targets(goals), lanes)
     states, clock = compiled.warmup(states, Clock.start(), lanes)
     history = []
     for _ in range(chunks):
@@ -91,7 +97,7 @@ def assert_lane_equal(several, lane, alone, rtol=1e-4, atol=1e-5):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_makes_a_trainer(preset):
-    make_trainer(envs.make("grid_world"), envs.load_target("grid_world", "A"), PRESETS[preset][0])
+    make_trainer(envs.make("grid_world"), PRESETS[preset][0])
 
 
 PAIRS = [
@@ -106,7 +112,7 @@ PAIRS = [
 def assert_makes_a_program(trainer):
     """Traced, not compiled: shapes and dtypes fit, the state keeps its structure, and nothing is done by the host."""
     hparams = jax.tree.map(jnp.float32, HParams())
-    state = jax.eval_shape(trainer.init, jax.random.key(0), hparams)
+    state = jax.eval_shape(trainer.init, jax.random.key(0), task_struct(trainer.space), hparams)
     jaxpr, (after, _, metrics) = jax.make_jaxpr(trainer.chunk, return_shape=True)(state, Clock.start(), hparams)
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert "target_return" in metrics
@@ -115,14 +121,14 @@ def assert_makes_a_program(trainer):
 
 @pytest.mark.parametrize("method", PAIRS)
 def test_every_curriculum_and_bonus_make_a_program(method):
-    assert_makes_a_program(make_trainer(SPACE, TARGET, config(method)))
+    assert_makes_a_program(make_trainer(SPACE, config(method)))
 
 
 @pytest.mark.parametrize("space", ["grid_world", "manipulation"])
 @pytest.mark.parametrize("method", ["apt_gen+rnd", "alp_gmm+ride", "goal_gan+icm", "random"])
 def test_every_part_fits_every_space(method, space):
     cfg = config(method, warmup_steps=1_000)
-    assert_makes_a_program(make_trainer(envs.make(space), envs.load_target(space, "A"), cfg))
+    assert_makes_a_program(make_trainer(envs.make(space), cfg))
 
 
 def test_the_averaged_policy_is_judged():
@@ -169,8 +175,8 @@ class Paying(Corridor):
 def test_a_space_that_is_not_what_its_specs_say_is_refused():
     """The replay would cast in silence."""
     with pytest.raises(ValueError, match=r"corridor.reset must return observations like .*uint8.*, got .*float32"):
-        make_trainer(Casting(), TARGET, CONFIG)
-    trainer = make_trainer(Paying(), TARGET, CONFIG)
+        make_trainer(Casting(), CONFIG)
+    trainer = make_trainer(Paying(), CONFIG)
     with pytest.raises(ValueError, match=r"corridor.step must return a float32 reward, .*got .*int32"):
         jax.eval_shape(make_program(trainer, 1).warmup, *lane_struct(trainer))
 
@@ -178,12 +184,12 @@ def test_a_space_that_is_not_what_its_specs_say_is_refused():
 def lane_struct(trainer):
     lanes = stack_hparams([HParams()])
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 1))
-    return jax.eval_shape(make_program(trainer, 1).init, keys, lanes), Clock.start(), lanes
+    return jax.eval_shape(make_program(trainer, 1).init, keys, targets(1), lanes), Clock.start(), lanes
 
 
 def test_64_bits_are_refused():
     with jax.enable_x64(True), pytest.raises(ValueError, match="computes with 32 bits: unset jax_enable_x64"):
-        make_trainer(SPACE, TARGET, CONFIG)
+        make_trainer(SPACE, CONFIG)
 
 
 def test_hparams_out_of_range_are_refused():
@@ -194,12 +200,13 @@ def test_hparams_out_of_range_are_refused():
 def test_a_method_of_unknown_parts_is_refused(monkeypatch):
     monkeypatch.setitem(METHODS, "mine", Method("alp-gmm"))
     with pytest.raises(ValueError, match="unknown curriculum 'alp-gmm'; closest is 'alp_gmm'"):
-        make_trainer(SPACE, TARGET, config("mine"))
+        make_trainer(SPACE, config("mine"))
 
 
 def test_a_target_of_another_shape_is_refused():
+    compiled = program(config("dqn"), 1, "map")
     with pytest.raises(ValueError, match="must look like a task of corridor"):
-        make_trainer(SPACE, np.zeros(3, np.int32), CONFIG)
+        compiled.init(jax.random.split(jax.random.key(0), 1), np.zeros((1, 3), np.int32), stack_hparams([HParams()]))
 
 
 def test_diversity_sees_a_collapse_of_one_modality():
@@ -235,13 +242,13 @@ def test_a_seed_of_another_method_is_the_same_beside_any_other(method, layout):
 
 def test_lanes_may_be_laid_out_in_groups():
     """Five lanes on two devices, two at once on each."""
-    trainer = make_trainer(SPACE, TARGET, config("dqn"))
+    trainer = make_trainer(SPACE, config("dqn"))
     lanes = stack_hparams([HParams()] * 5)
 
     def states(**options):
         compiled = make_program(trainer, 5, layout="vmap", **options)
         keys = jax.vmap(jax.random.key)(np.arange(5))
-        return compiled.warmup(compiled.init(keys, lanes), Clock.start(), lanes)[0]
+        return compiled.warmup(compiled.init(keys, targets(5), lanes), Clock.start(), lanes)[0]
 
     for a, b in zip(leaves(states(at_once=2)), leaves(states()), strict=True):
         np.testing.assert_allclose(a[:5], b[:5], rtol=1e-4, atol=1e-5)
@@ -263,8 +270,8 @@ def test_fewer_lanes_than_devices_are_shared_by_all_processes():
 
 
 def test_there_is_room_for_as_many_lanes_as_the_memory_holds_twice():
-    trainer = make_trainer(SPACE, TARGET, config("dqn"))
-    state = jax.tree.leaves(jax.eval_shape(trainer.init, jax.random.key(0), jax.tree.map(jnp.float32, HParams())))
+    trainer = make_trainer(SPACE, config("dqn"))
+    state = jax.tree.leaves(jax.eval_shape(trainer.init, jax.random.key(0), TARGET, jax.tree.map(jnp.float32, HParams())))
     assert lane_bytes(trainer) == sum(leaf.size * leaf.dtype.itemsize for leaf in state)
     assert [room(trainer, memory) for memory in (1, 7 * lane_bytes(trainer))] == [1, 3]
 
@@ -305,6 +312,14 @@ def test_hyper_parameter_lanes_equal_separate_runs():
     assert any(not np.allclose(a, b) for a, b in zip(first, second, strict=True))
 
 
+def test_lanes_may_have_targets_of_their_own():
+    both, _, _ = run(config("dqn"), [0, 1], goals=[TARGET, np.int32(3)])
+    near, _, history = run(config("dqn"), [2, 1], goals=[np.int32(3)] * 2)
+    assert np.asarray(both.target).tolist() == [TARGET, 3]
+    assert_lane_equal(both, 1, jax.tree.map(lambda x: x[1:], near))
+    assert history[-1]["behaviour_success"][1] > 0
+
+
 def test_seeds_differ():
     states, _, _ = run(config("random"), [0, 1], chunks=1)
     kernels = leaves(states.learner.params)
@@ -330,7 +345,7 @@ def test_nothing_compiles_after_the_first_chunk(method):
 def test_states_are_donated():
     compiled = program(config("random"), 2, "map")
     lanes = stack_hparams([HParams()] * 2)
-    states = compiled.init(jax.random.split(jax.random.key(0), 2), lanes)
+    states = compiled.init(jax.random.split(jax.random.key(0), 2), targets(2), lanes)
     compiled.warmup(states, Clock.start(), lanes)
     assert states.replay.transitions.reward.is_deleted()
 
@@ -376,9 +391,9 @@ def test_methods_learn_a_shorter_corridor(method):
     paper = {name: PAPER[name] for name in SWITCHES}
     sizes = {"warmup_steps": 400, "updates_per_step": 2, "batch_size": 64, "replay_steps": 2000}
     cfg = config(method, **paper, **sizes, refresh_every=100, eval_every=400)
-    compiled = make_program(make_trainer(SPACE, np.int32(5), cfg), 2)
+    compiled = make_program(make_trainer(SPACE, cfg), 2)
     lanes = stack_hparams([HParams(learning_rate=1e-3, epsilon_steps=400.0)] * 2)
-    states = compiled.init(jax.vmap(jax.random.key)(np.arange(2)), lanes)
+    states = compiled.init(jax.vmap(jax.random.key)(np.arange(2)), np.full(2, 5, np.int32), lanes)
     states, clock = compiled.warmup(states, Clock.start(), lanes)
     for _ in range(8):
         states, clock, metrics = compiled.chunk(states, clock, lanes)
@@ -435,4 +450,4 @@ def test_resuming_from_a_checkpoint_equals_never_having_stopped(saved_between_ch
 )
 def test_sizes_that_do_not_fit_are_named(changes, words):
     with pytest.raises(ValueError, match=words):
-        make_trainer(SPACE, TARGET, dataclasses.replace(CONFIG, **changes))
+        make_trainer(SPACE, dataclasses.replace(CONFIG, **changes))

@@ -64,8 +64,8 @@ def time_step(capacity: int, args: Args) -> Timing:
         eval_episodes=1,
         probe_tasks=1,
     )
-    trainer = make_trainer(space, target, config)
-    state = jax.jit(trainer.init)(jax.random.key(0), hparams)
+    trainer = make_trainer(space, config)
+    state = jax.jit(trainer.init)(jax.random.key(0), target, hparams)
     # A clock past the ring's end makes samples come from all of the ring.
     columns = capacity // config.envs_per_source
     clock = Clock(iteration=jnp.int32(columns), env_steps=jnp.int32(2 * capacity))

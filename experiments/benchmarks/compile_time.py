@@ -19,7 +19,7 @@ from typing import Any, Literal
 import jax
 import tyro
 
-from apt_jax.lanes import make_program, stack_hparams
+from apt_jax.lanes import make_program, stack_hparams, stack_targets
 from apt_jax.trainer import Clock, make_trainer
 from experiments import runtime
 from experiments.benchmarks import _measure
@@ -123,8 +123,8 @@ def start(cache: Path, args: Args, *, requested: float) -> Start:
     runtime.setup()
     jax.config.update("jax_compilation_cache_dir", str(cache))
     space, target, config, one = _measure.load_problem(args.preset, space=args.space)
-    program = make_program(make_trainer(space, target, config), args.seeds)
-    hparams = stack_hparams([one] * args.seeds)
+    program = make_program(make_trainer(space, config), args.seeds)
+    targets, hparams = stack_targets([target] * args.seeds), stack_hparams([one] * args.seeds)
     programs = Programs.of(args)
 
     def compile_ahead(name: str, function: Callable[..., Any], *args: Any) -> tuple[Callable[..., Any], float]:
@@ -132,8 +132,8 @@ def start(cache: Path, args: Args, *, requested: float) -> Start:
         return programs.compile(name, function, *args), time.perf_counter() - began
 
     keys = jax.random.split(jax.random.key(0), args.seeds)
-    init, init_seconds = compile_ahead("init", program.init, keys, hparams)
-    states, clock = init(keys, hparams), Clock.start()
+    init, init_seconds = compile_ahead("init", program.init, keys, targets, hparams)
+    states, clock = init(keys, targets, hparams), Clock.start()
     warmup, warmup_seconds = compile_ahead("warmup", program.warmup, states, clock, hparams)
     states, clock = warmup(states, clock, hparams)
     chunk, chunk_seconds = compile_ahead("chunk", program.chunk, states, clock, hparams)

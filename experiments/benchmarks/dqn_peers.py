@@ -92,8 +92,8 @@ def time_ours(args: Args) -> Timing:
         eval_every=args.steps,
         eval_episodes=1,
     )
-    trainer = make_trainer(CartPole(), TASK, config)
-    state = jax.jit(trainer.init)(jax.random.key(0), HPARAMS)
+    trainer = make_trainer(CartPole(), config)
+    state = jax.jit(trainer.init)(jax.random.key(0), TASK, HPARAMS)
     carry = jax.jit(trainer.warmup, donate_argnums=0)(state, Clock.start(), HPARAMS)
     timing, _ = _measure.time_calls(trainer.chunk, carry, HPARAMS, repeats=args.repeats)
     return timing.per(args.steps)

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import tyro
 from matplotlib.figure import Figure
 
-from apt_jax.lanes import make_program, stack_hparams
+from apt_jax.lanes import make_program, stack_hparams, stack_targets
 from apt_jax.specs import param_struct
 from apt_jax.trainer import Clock, make_trainer
 from envs.grid_world.dynamics import HORIZON
@@ -142,9 +142,9 @@ def load_problem(point: Point, quick: bool) -> Problem:
 def measure(point: Point, args: Args) -> Cost:
     """What an iteration costs; where all numbers are the usual ones, axes meet."""
     space, target, config, hparams = load_problem(point, args.quick)
-    trainer = make_trainer(space, target, config)
+    trainer = make_trainer(space, config)
     program, lanes = make_program(trainer, point.seeds), stack_hparams([hparams] * point.seeds)
-    states = program.init(jax.random.split(jax.random.key(0), point.seeds), lanes)
+    states = program.init(jax.random.split(jax.random.key(0), point.seeds), stack_targets([target] * point.seeds), lanes)
     # A clock past the ring's end makes samples come from all of the ring.
     columns = config.replay_steps // config.envs_per_source
     clock = Clock(iteration=jnp.int32(columns), env_steps=jnp.int32(SOURCES * config.replay_steps))

@@ -72,10 +72,10 @@ def time_method(method: str, args: Args) -> Timing:
     sizes: dict[str, Any] = QUICK if args.quick else {"eval_every": args.chunk_steps}
     space, target, config, hparams = _measure.load_problem(args.preset, method=method, **sizes)
     try:
-        trainer = make_trainer(space, target, config)
+        trainer = make_trainer(space, config)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    state = jax.jit(trainer.init)(jax.random.key(0), hparams)
+    state = jax.jit(trainer.init)(jax.random.key(0), target, hparams)
     carry = jax.jit(trainer.warmup, donate_argnums=0)(state, Clock.start(), hparams)
     timing, _ = _measure.time_calls(trainer.chunk, carry, hparams, repeats=args.repeats)
     return timing.per(args.chunk_steps / 1_000)

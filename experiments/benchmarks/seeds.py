@@ -95,9 +95,9 @@ def time_seeds(layout: Literal["map", "vmap"], devices: int, args: Args) -> Arra
         eval_episodes=1,
         probe_tasks=1,
     )
-    trainer = make_trainer(space, target, config)
+    trainer = make_trainer(space, config)
     # One warm-up serves all: compiling it for every number of seeds would take longer than everything measured.
-    state = jax.jit(trainer.init)(jax.random.key(0), hparams)
+    state = jax.jit(trainer.init)(jax.random.key(0), target, hparams)
     state, clock = jax.jit(trainer.warmup, donate_argnums=0)(state, Clock.start(), hparams)
     mesh = Mesh(np.array(jax.devices()[:devices]), ("lane",))
     shared, lane = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("lane"))

@@ -198,14 +198,14 @@ def together(pieces: Sequence[Work], *, seconds: float) -> Work:
 
 def start(problem: Problem) -> tuple[TrainState, Clock]:
     """The state after warm-up."""
-    trainer = make_trainer(problem.space, problem.target, problem.config)
-    state = jax.jit(trainer.init)(jax.random.key(0), problem.hparams)
+    trainer = make_trainer(problem.space, problem.config)
+    state = jax.jit(trainer.init)(jax.random.key(0), problem.target, problem.hparams)
     return jax.jit(trainer.warmup, donate_argnums=0)(state, Clock.start(), problem.hparams)
 
 
 def time_chunk(problem: Problem, state: TrainState, clock: Clock, repeats: int) -> tuple[Timing, tuple[Any, ...]]:
     """The time of a chunk, and the state and clock after all repeats."""
-    trainer = make_trainer(problem.space, problem.target, problem.config)
+    trainer = make_trainer(problem.space, problem.config)
     return _measure.time_calls(trainer.chunk, (state, clock), problem.hparams, repeats=repeats)
 
 

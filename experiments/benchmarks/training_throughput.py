@@ -27,7 +27,7 @@ from typing import Any, Literal
 import jax
 import tyro
 
-from apt_jax.lanes import make_program, stack_hparams
+from apt_jax.lanes import make_program, stack_hparams, stack_targets
 from apt_jax.trainer import Clock, make_trainer
 from experiments.benchmarks import _measure
 from experiments.benchmarks._in_turns import Begun, Worker
@@ -132,12 +132,12 @@ def begin_ours(args: Args, seeds: int, cores: int) -> Begun:
     jax.config.update("jax_num_cpu_devices", cores)
     space, target, config, hparams = load_problem(args)
     try:
-        trainer = make_trainer(space, target, config)
+        trainer = make_trainer(space, config)
     except ValueError as error:
         raise UsageError(str(error)) from error
     program = make_program(trainer, seeds)
     lanes = stack_hparams([hparams] * seeds)
-    states = program.init(jax.random.split(jax.random.key(0), seeds), lanes)
+    states = program.init(jax.random.split(jax.random.key(0), seeds), stack_targets([target] * seeds), lanes)
     states, clock = program.warmup(states, Clock.start(), lanes)
     chunk, compile_seconds = _measure.compile_ahead(program.chunk, states, clock, lanes)
 

@@ -309,8 +309,8 @@ def load_problem(args: Args) -> Problem:
 
 def play(problem: Problem) -> Replay:
     """The replay after the warm-up, on the host."""
-    trainer = make_trainer(problem.space, problem.target, problem.config)
-    state = jax.jit(trainer.init)(jax.random.key(0), problem.hparams)
+    trainer = make_trainer(problem.space, problem.config)
+    state = jax.jit(trainer.init)(jax.random.key(0), problem.target, problem.hparams)
     state, _ = jax.jit(trainer.warmup, donate_argnums=0)(state, Clock.start(), problem.hparams)
     rings: Replay = jax.device_get(state.replay)
     return rings
