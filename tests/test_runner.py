@@ -44,27 +44,32 @@ def start(experiment, trainer, programs=None, *, target=7):
     return runner
 
 
-def test_seeds_that_do_not_fit_take_turns(experiment, monkeypatch, tmp_path):
-    """Two devices with room for two seeds each, against all at once, just compiled and loaded; a checkpoint of one goes on in
-    the other.
+@pytest.fixture(scope="module")
+def kept(experiment, tmp_path_factory):
+    """A folder with the compiled programs of the run."""
+    folder = tmp_path_factory.mktemp("programs")
+    start(*experiment, Programs(folder))
+    return folder
+
+
+def test_seeds_that_do_not_fit_take_turns(experiment, kept, monkeypatch, tmp_path):
+    """Two devices with room for two seeds each, against all at once; a checkpoint of one goes on in the other.
 
     Both ways a device loops over its seeds, so that XLA computes them alike, to the last bit.
     """
-    together = start(*experiment, Programs(tmp_path / "programs"))
-    again = start(*experiment, Programs(tmp_path / "programs"))
-    assert again.programs.loaded == 3
+    together = start(*experiment, Programs(kept))
+    assert together.programs.loaded == 3
     assert together.placement.startswith("5 lanes of 0.")
     monkeypatch.setattr(runtime, "device_memory", lambda: 4 * lane_bytes(experiment[1]))
     in_turns = start(*experiment)
     assert in_turns.placement.endswith("do not fit the devices' memory: 4 at a time take turns, the others wait in the host's")
 
-    for runner in (together, again, in_turns):
+    for runner in (together, in_turns):
         runner.warmup()
-    expected = together.advance()
-    for metrics in (again.advance(), in_turns.advance()):
-        assert metrics.keys() == expected.keys()
-        for name, values in metrics.items():
-            np.testing.assert_array_equal(values, expected[name])
+    expected, metrics = together.advance(), in_turns.advance()
+    assert metrics.keys() == expected.keys()
+    for name, values in metrics.items():
+        np.testing.assert_array_equal(values, expected[name])
 
     in_turns.save(tmp_path / "checkpoints")
     expected = together.advance()
@@ -75,14 +80,14 @@ def test_seeds_that_do_not_fit_take_turns(experiment, monkeypatch, tmp_path):
         assert all(leaf.shape[0] == 5 for leaf in jax.tree.leaves(runner.policies()))
 
 
-def test_programs_serve_every_target(experiment, tmp_path):
-    start(*experiment, Programs(tmp_path))
-    loading = start(*experiment, Programs(tmp_path), target=3)
+def test_programs_serve_every_target(experiment, kept):
+    """Loaded, they do for another target what ones that were just compiled do."""
+    loading = start(*experiment, Programs(kept), target=3)
     assert (loading.programs.loaded, loading.programs.compiled) == (3, 0)
-    alone = start(*experiment, target=3)
-    for runner in (loading, alone):
+    compiled = start(*experiment, target=3)
+    for runner in (loading, compiled):
         runner.warmup()
-    expected = alone.advance()
+    expected = compiled.advance()
     for name, values in loading.advance().items():
         np.testing.assert_array_equal(values, expected[name])
     assert np.any(expected["behaviour_success"] > 0)
