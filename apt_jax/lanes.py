@@ -33,7 +33,8 @@ Layout = Literal["auto", "vmap", "map"]
 class Program(NamedTuple):
     """A trainer over L lanes, jitted; states are donated: after a call only the returned one is valid.
 
-    States and metrics hold at least L lanes: the last is repeated up to a multiple of the devices.
+    States and metrics hold at least L lanes: the last is repeated up to a multiple of the devices.  Keys, targets or hparams of
+    another number of lanes raise a `ValueError`, as does a target that is not like the space's tasks.
 
     Attributes:
       init: `init(keys, targets, hparams) -> states`, for keys [L], and targets and hparams with leaves [L, ...].
@@ -112,6 +113,9 @@ def make_program(
     padded = np.minimum(np.arange(lanes + -lanes % len(used)), lanes - 1)
 
     def pad(tree: Any) -> Any:
+        for leaf in jax.tree.leaves(tree):
+            if leaf.shape[:1] != (lanes,):  # traced, an index out of bounds would take the last one in silence
+                raise ValueError(f"a program of {lanes} lanes needs arrays [{lanes}, ...], got one of shape {leaf.shape}")
         return jax.tree.map(lambda x: x[padded], tree)
 
     def sharded(batched: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:

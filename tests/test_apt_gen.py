@@ -60,7 +60,7 @@ def trainer(curriculum, experience, rounds):
 @pytest.mark.parametrize(
     ("weights", "optima"),
     [
-        ({}, {0.125: 2.667, 8.0: 7.333}),
+        ({}, {0.125: 2.667, 3.0: 6.5, 8.0: 7.333}),
         ({"progress_weight": 0.0}, {1.0: 8.0}),
         ({"return_weight": 0.0}, {1.0: 2.0}),
     ],

@@ -5,7 +5,6 @@ That nothing is compiled after the first chunk is in `test_trainer`.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from typing import ClassVar, NamedTuple
@@ -133,8 +132,8 @@ def text(chunk):
     return chunk.as_text()
 
 
-def program(count=2, config=CONFIG, **options):
-    return make_program(make_trainer(PairedCorridor(), config), count, **options)
+def program(count=2, **options):
+    return make_program(make_trainer(PairedCorridor(), CONFIG), count, **options)
 
 
 def lanes(count=2):
@@ -162,8 +161,8 @@ def test_lanes_side_by_side_copy_no_ring(states):
 
 
 def test_lanes_that_take_turns_have_room_for_one_besides():
-    """Three on one device: the one at work is taken out and put back, whatever its method does with it."""
-    turns = program(3, dataclasses.replace(CONFIG, method="dqn"), layout="map", devices=jax.devices()[:1])
+    """Three on one device: the one at work is taken out and put back."""
+    turns = program(3, layout="map", devices=jax.devices()[:1])
     states = jax.eval_shape(turns.init, *lanes(3))
     memory = turns.chunk.lower(states, jax.eval_shape(Clock.start), lanes(3)[-1]).compile().memory_analysis()
     one = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(states.replay)) / 3

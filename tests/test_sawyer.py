@@ -28,7 +28,7 @@ from experiments.errors import UsageError
 from tests.tables import AWAY, BLUE, GREEN, LEFT, NEAR, RIGHT, push_all, table
 from tests.test_manipulation_physics import random_cases
 
-PUSHES = 30
+PUSHES = 50
 
 
 def flange_by_hand(joints):

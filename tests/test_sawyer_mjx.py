@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import functools
 
 import jax
@@ -209,8 +208,8 @@ class TestOption:
 def test_the_arm_in_mjx_goes_through_the_whole_program():
     """Traced, not compiled."""
     config, hparams = PRESETS["fast"]
-    config = dataclasses.replace(config, method="dqn")  # of the trainer, the environments are what meets the arm
     trainer = make_trainer(envs.make("manipulation_sawyer"), config)
     start = jax.eval_shape(trainer.init, jax.random.key(0), envs.load_target("manipulation_sawyer", "B"), hparams)
-    clock = jax.eval_shape(Clock.start)
-    assert jax.eval_shape(trainer.chunk, start, clock, hparams)[:2] == (start, clock)
+    warm = jax.eval_shape(trainer.warmup, start, Clock.start(), hparams)
+    assert jax.eval_shape(trainer.chunk, *warm, hparams)[:2] == warm
+    assert warm[0] == start
