@@ -19,13 +19,18 @@ Tree = TypeVar("Tree")
 
 
 class CheckpointError(Exception):
-    """A checkpoint is missing, damaged, or of another shape than asked for."""
+    """A checkpoint is missing, damaged, of another shape than asked for, or in the way of one to be saved."""
 
 
 def save(directory: Path, step: int, tree: Any) -> None:
-    """Writes `tree` as the checkpoint of `step` and drops older ones; returns once it is on disk."""
+    """Writes `tree` as the checkpoint of `step` and drops older ones; returns once it is on disk.
+
+    Raises:
+      CheckpointError: the directory has a checkpoint of that step or a later one.
+    """
     with _manager(directory) as manager:
-        manager.save(step, args=ocp.args.StandardSave(tree))
+        if not manager.save(step, args=ocp.args.StandardSave(tree)):
+            raise CheckpointError(f"{directory} has a checkpoint of step {latest_step(directory)}, got step {step} to save")
 
 
 def restore(directory: Path, template: Tree) -> Tree:

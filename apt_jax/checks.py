@@ -130,7 +130,7 @@ def check_space(space: TaskSpace) -> None:
         ("sample_uniform must return", w, param_struct(space.param_spec)),
         ("reset must return observations like", obs, obs_struct(space.obs_spec)),
     ):
-        if given != expected:
+        if _struct(given) != _struct(expected):
             raise ValueError(f"{space.name}.{name} {expected}, got {given}")
 
 
@@ -147,5 +147,5 @@ def check_target(space: TaskSpace, target: Any) -> None:
 
 
 def _struct(tree: Any) -> Any:
-    """Shapes and dtypes alone: where it is traced, an array also knows how it is sharded."""
+    """Shapes and dtypes alone: an array also knows whether its dtype is weak and, where it is traced, how it is sharded."""
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)

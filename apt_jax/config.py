@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import sys
 from dataclasses import dataclass
 from typing import Literal
 
 import flax.struct
+import numpy as np
 
 Covariance = Literal["full", "diagonal"]
 """Of ALP-GMM's components."""
@@ -39,7 +39,7 @@ class HParams:
       beta_min: lower bound of beta (paper: 1/8).
       beta_max: upper bound of beta (paper: 8).
       pessimism: standard deviations of the value ensemble taken off its mean, >= 0; nothing for an ensemble of one.
-      value_weight_decay: decoupled weight decay of the value networks, per unit of their learning rate, >= 0.
+      value_weight_decay: decoupled weight decay of the value networks, biases included, per unit of their learning rate, >= 0.
       recency: how much discriminator and values prefer recent generated episodes (`replay.sample_rollouts`), >= 1; 1 draws
         uniformly from the window (paper).
       cell_noise: probability that a cell of a generated grid, or a row of a table, is played with a uniformly drawn category,
@@ -104,10 +104,11 @@ def check_hparams(hparams: HParams) -> None:
     Raises:
       ValueError: the field, its value, and what is allowed.
     """
-    positive = ("reset_every", "epsilon_steps", "beta_min", "spectral_bound", "alp_regularisation")
-    not_negative = ("tolerance", "pessimism", "value_weight_decay", "vector_noise", "vector_prior", "goal_noise")
+    positive = ("reset_every", "epsilon_steps", "spectral_bound")
+    positive_finite = ("beta_min", "beta_max", "alp_regularisation")
     rates = tuple(field.name for field in dataclasses.fields(hparams) if field.name.endswith("learning_rate"))
     scales = ("icm_scale", "rnd_scale", "ride_scale")
+    not_negative = ("pessimism", "value_weight_decay", "vector_noise", "vector_prior", "goal_noise")
     shares = (
         "gamma",
         "target_rate",
@@ -119,12 +120,14 @@ def check_hparams(hparams: HParams) -> None:
         "goal_high",
         "goal_old_share",
     )
+    smallest, largest = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
     ranges = {
         "recency": (1.0, math.inf, "at least 1"),
-        "delta": (-sys.float_info.max, sys.float_info.max, "finite"),
-        **dict.fromkeys(positive, (math.ulp(0.0), math.inf, "above 0")),
-        **dict.fromkeys(not_negative, (0.0, math.inf, "at least 0")),
-        **dict.fromkeys(rates + scales, (0.0, sys.float_info.max, "finite and at least 0")),
+        "tolerance": (0.0, math.inf, "at least 0"),
+        "delta": (-largest, largest, "finite"),
+        **dict.fromkeys(positive, (smallest, math.inf, "above 0")),
+        **dict.fromkeys(positive_finite, (smallest, largest, "finite and above 0")),
+        **dict.fromkeys(not_negative + rates + scales, (0.0, largest, "finite and at least 0")),
         **dict.fromkeys(shares, (0.0, 1.0, "in [0, 1]")),
     }
     for name, (low, high, allowed) in ranges.items():

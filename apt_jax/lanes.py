@@ -22,7 +22,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Int, Key
 
 from apt_jax.config import HParams, check_hparams
-from apt_jax.curricula.base import Metrics
+from apt_jax.plugin import Metrics
 from apt_jax.task_space import task_struct
 from apt_jax.trainer import Clock, Trainer, TrainState
 from apt_jax.turns import Turns
@@ -37,7 +37,8 @@ class Program(NamedTuple):
     another number of lanes raise a `ValueError`, as does a target that is not like the space's tasks.
 
     Attributes:
-      init: `init(keys, targets, hparams) -> states`, for keys [L], and targets and hparams with leaves [L, ...].
+      init: `init(keys, targets, hparams) -> states`, for keys [L], and targets and hparams with leaves [L, ...]; of several
+        devices none may be committed to one.
       warmup: `warmup(states, clock, hparams) -> (states, clock)`.
       chunk: `chunk(states, clock, hparams) -> (states, clock, metrics)`.
     """
@@ -51,15 +52,23 @@ def stack_hparams(hparams: Sequence[HParams]) -> HParams:
     """HParams of single lanes as one with leaves float32 [L].
 
     Raises:
-      ValueError: a value out of its range (`check_hparams`).
+      ValueError: no lane, or a value out of its range (`check_hparams`).
     """
+    if not hparams:
+        raise ValueError("there must be at least one lane")
     for lane in hparams:
         check_hparams(lane)
     return jax.tree.map(lambda *leaves: np.asarray(leaves, np.float32), *hparams)
 
 
 def stack_targets(targets: Sequence[Any]) -> Any:
-    """Target tasks of single lanes, all of one space, as one with leaves [L, ...]."""
+    """Target tasks of single lanes, all of one space, as one with leaves [L, ...].
+
+    Raises:
+      ValueError: no lane.
+    """
+    if not targets:
+        raise ValueError("there must be at least one lane")
     return jax.tree.map(lambda *leaves: np.stack([jnp.asarray(x) for x in leaves]), *targets)
 
 
@@ -68,7 +77,6 @@ def make_program(
     lanes: int,
     *,
     layout: Layout = "auto",
-    at_once: int | None = None,
     resident: int | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Program:
@@ -76,19 +84,16 @@ def make_program(
 
     Args:
       layout: how the lanes of one device are laid out; "auto" is "map" on CPU and "vmap" elsewhere.
-      at_once: lanes of one device that "vmap" puts side by side, the others in turn, if not all fit its memory; all by default,
-        and without effect under "map".
       resident: lanes that one device's memory has room for; if there are more, groups of them take turns (`apt_jax.turns`), and
         states are kept by the host.  All fit by default.
       devices: what to shard lanes over, by default every device of every process; no more are used than there are lanes.
 
     Raises:
-      ValueError: fewer than one lane, or than one at once, or fewer lanes than processes, or several processes with more lanes
-        than there is room for,
-        or no CPU among JAX's platforms where lanes take turns.
+      ValueError: fewer than one lane, or fewer lanes than processes, or several processes with more lanes than there is room
+        for, or no CPU among JAX's platforms where lanes take turns.
     """
-    if lanes < 1 or (at_once is not None and at_once < 1):
-        raise ValueError(f"a program needs at least one lane and one at once, got {lanes} and {at_once}")
+    if lanes < 1:
+        raise ValueError(f"a program needs at least one lane, got {lanes}")
     used = _spread(devices or jax.devices(), lanes)
     if resident is not None and lanes > resident * len(used):
         group = resident * len(used)
@@ -101,15 +106,13 @@ def make_program(
                 f"the devices have room for {group} lanes, got {lanes}, and the others cannot wait in the host's memory: "
                 "JAX_PLATFORMS leaves the CPU out; add it, as in JAX_PLATFORMS=cuda,cpu"
             ) from error
-        program = make_program(trainer, group, layout=layout, at_once=at_once, devices=used)
+        program = make_program(trainer, group, layout=layout, devices=used)
         mesh = Mesh(np.array(used), ("lane",))
         return Program(*(Turns(function, lanes, group, mesh) for function in program))
     if layout == "auto":
         layout = "map" if used[0].platform == "cpu" else "vmap"
     mesh = Mesh(np.array(used), ("lane",))
     lane, shared = PartitionSpec("lane"), PartitionSpec()
-    per_device = -(-lanes // len(used))
-    width = 1 if layout == "map" else min(at_once or per_device, per_device)
     padded = np.minimum(np.arange(lanes + -lanes % len(used)), lanes - 1)
 
     def pad(tree: Any) -> Any:
@@ -122,21 +125,24 @@ def make_program(
         return jax.shard_map(batched, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
 
     def over_lanes(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
-        if width == per_device and layout == "vmap":
-            return sharded(_vmap(function, in_specs, out_specs), in_specs, out_specs)
-        return sharded(_map(function, in_specs, out_specs, width=width), in_specs, out_specs)
+        batched = (_vmap if layout == "vmap" else _map)(function, in_specs, out_specs)
+        return sharded(batched, in_specs, out_specs)
 
     def init_lanes(keys: Key[Array, "L"], targets: Any, hparams: HParams) -> TrainState:
-        return jax.lax.map(lambda lane: trainer.init(*lane), (keys, targets, hparams), batch_size=None if width == 1 else width)
+        if layout == "vmap":
+            return jax.vmap(trainer.init)(keys, targets, hparams)
+        return jax.lax.map(lambda one: trainer.init(*one), (keys, targets, hparams))
 
     init = sharded(init_lanes, (lane, lane, lane), lane)
     warmup = over_lanes(trainer.warmup, (lane, shared, lane), (lane, shared))
     chunk = over_lanes(trainer.chunk, (lane, shared, lane), (lane, shared, lane))
 
     # What runs once is better compiled sooner than made faster.  XLA's simpler emitters for the CPU take 10 to 40 % less time.
-    simpler = {"xla_cpu_use_fusion_emitters": False} if used[0].platform == "cpu" else {}
+    on_cpu = used[0].platform == "cpu"
+    simpler = {"xla_cpu_use_fusion_emitters": False} if on_cpu else {}
+    unoptimised = {"xla_backend_optimization_level": 0} if on_cpu else {}
 
-    @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0, **simpler})
+    @partial(jax.jit, compiler_options=unoptimised | simpler)
     def init_all(keys: Key[Array, "L"], targets: Any, hparams: HParams) -> TrainState:
         return init(pad(keys), pad(targets), pad(hparams))
 
@@ -187,44 +193,33 @@ def _vmap(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callab
     return jax.vmap(function, in_axes=_axes(in_specs), out_axes=_axes(out_specs))
 
 
-def _map(function: Callable[..., Any], in_specs: Any, out_specs: Any, *, width: int) -> Callable[..., Any]:
-    """Like `_vmap`, `width` lanes after `width` others, for functions whose first argument and first result are the states.
+def _map(function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
+    """Like `_vmap`, one lane after another, for functions whose first argument and first result are the states.
 
-    Each group's states are taken out of the others' and put back in their place, so that there is room for one group besides.
+    A lane is taken out of the others' states and put back in its place, so that there is room for one besides; it is no batch,
+    and computes what it computes alone.
     """
     lanes_in, lanes_out = ([axis == 0 for axis in _axes(specs)] for specs in (in_specs, out_specs))
-    several = _vmap(function, in_specs, out_specs)
-
-    def alone(*args: Any) -> tuple[Any, ...]:
-        """One lane, not as a batch, so that it computes what it computes by itself."""
-        lane = [jax.tree.map(lambda x: x[0], arg) if of_lanes else arg for of_lanes, arg in zip(lanes_in, args, strict=True)]
-        results = zip(lanes_out, function(*lane), strict=True)
-        return tuple(jax.tree.map(lambda x: x[None], result) if of_lanes else result for of_lanes, result in results)
 
     def mapped(states: TrainState, *rest: Any) -> Any:
-        def group(data: Any, start: Int[Array, ""] | int, size: int) -> tuple[Any, list[Any]]:
-            """All states after `size` lanes from `start` had their turn, and what else these yielded."""
+        def turn(data: Any, index: Int[Array, ""]) -> tuple[Any, list[Any]]:
+            """All states after lane `index` had its turn, and what else that yielded."""
 
             def pick(tree: Any) -> Any:
-                return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, size), tree)
+                return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, index, keepdims=False), tree)
 
-            turn = [pick(arg) if of_lanes else arg for of_lanes, arg in zip(lanes_in[1:], rest, strict=True)]
-            new, *yielded = (alone if size == 1 else several)(_with_keys(pick(data), states), *turn)
-            put = jax.lax.dynamic_update_slice_in_dim
-            return jax.tree.map(lambda old, x: put(old, x, start, 0), data, _as_data(new)), yielded
+            own = [pick(arg) if of_lanes else arg for of_lanes, arg in zip(lanes_in[1:], rest, strict=True)]
+            new, *yielded = function(_with_keys(pick(data), states), *own)
+            put = jax.lax.dynamic_update_index_in_dim
+            return jax.tree.map(lambda old, x: put(old, x, index, 0), data, _as_data(new)), yielded
 
-        turns, left = divmod(jax.tree.leaves(states)[0].shape[0], width)
-        starts = width * jnp.arange(turns, dtype=jnp.int32)
-        data, yielded = jax.lax.scan(lambda data, start: group(data, start, width), _as_data(states), starts)
-        # What is shared came out once per turn, all alike.
-        flat = {True: lambda x: x.reshape(-1, *x.shape[2:]), False: lambda x: x[0]}
-        results = [jax.tree.map(flat[of_lanes], value) for of_lanes, value in zip(lanes_out[1:], yielded, strict=True)]
-        if left:
-            data, last = group(data, turns * width, left)
-            results = [
-                jax.tree.map(lambda *parts: jnp.concatenate(parts), value, more) if of_lanes else value
-                for of_lanes, value, more in zip(lanes_out[1:], results, last, strict=True)
-            ]
+        lanes = jnp.arange(jax.tree.leaves(states)[0].shape[0], dtype=jnp.int32)
+        data, yielded = jax.lax.scan(turn, _as_data(states), lanes)
+        # What is shared came out once per lane, all alike.
+        results = (
+            value if of_lanes else jax.tree.map(lambda x: x[0], value)
+            for of_lanes, value in zip(lanes_out[1:], yielded, strict=True)
+        )
         return _with_keys(data, states), *results
 
     return mapped

@@ -83,6 +83,9 @@ def update(
       batch: leaves [B, ...].
       low: lower bound of the next-Q clip.
       high: upper bound of the next-Q clip.
+
+    Returns:
+      The learner after it, and the batch's mean of the loss and of the online network's largest value before it.
     """
     next_value = apply(network, state.target_params, batch.next_obs)
     next_selector = apply(network, state.params, batch.next_obs)

@@ -52,7 +52,16 @@ class Batch(NamedTuple):
 
 
 class Episode(NamedTuple):
-    """A finished episode: its task parameter, where its steps lie in the transition ring, and its outcome."""
+    """A finished episode: its task parameter, where its steps lie in the transition ring, and its outcome.
+
+    Attributes:
+      w: without leaves where nothing is generated.
+      env: index of its environment, in [0, E).
+      end: iteration of its last step; those of the others lie before it, one each.
+      length: steps.
+      episode_return: undiscounted.
+      success: at any of its steps.
+    """
 
     w: Params
     env: Int[Array, "..."]
@@ -113,7 +122,10 @@ class Rollouts(NamedTuple):
 
 
 def init(obs_spec: Spec, param_spec: Spec, *, sources: int, envs: int, columns: int, episodes: int, note: Any = ()) -> Replay:
-    """An empty replay; `note` is the structure (`ShapeDtypeStruct`s) of one step's note."""
+    """An empty replay; `note` is the structure (`ShapeDtypeStruct`s) of one step's note.
+
+    `param_spec` is to be empty where nothing is generated.
+    """
     obs = zeros_like(obs_struct(obs_spec), (sources, envs, columns))
     step = (sources, envs, columns)
     slot = (sources, episodes)
@@ -143,7 +155,10 @@ def init(obs_spec: Spec, param_spec: Spec, *, sources: int, envs: int, columns: 
 def write(
     replay: Replay, iteration: Int[Array, ""], transition: Transition, episode: Episode, done: Bool[Array, "S E"]
 ) -> Replay:
-    """Write one transition of every environment and the episodes that `done` marks; leaves [S, E, ...]."""
+    """Write one transition of every environment and the episodes that `done` marks; leaves [S, E, ...].
+
+    Iterations count up from 0 without a gap: an episode's steps are found by that.
+    """
     columns = replay.transitions.action.shape[2]
     slots = replay.episodes.env.shape[1]
     position = iteration % columns
@@ -314,13 +329,9 @@ def recent_outcome(replay: Replay, *, source: int, window: int, since: int = 0) 
 
     NaN before the first.
     """
-    slots = replay.episodes.env.shape[1]
-    count = jnp.minimum(replay.finished[source], window)
-    back = jnp.arange(window, dtype=jnp.int32)
-    slot = (replay.finished[source] - 1 - back) % slots
-    began = replay.episodes.end[source, slot] - replay.episodes.length[source, slot] + 1
-    valid = (back < count) & (began >= since)
+    episodes, earlier = latest_episodes(replay, source=source, count=window)
+    valid = (earlier >= 0) & (episodes.end - episodes.length + 1 >= since)
 
     names = ("episode_return", "success", "length")
-    outcomes = jnp.stack([getattr(replay.episodes, name)[source, slot].astype(jnp.float32) for name in names])
+    outcomes = jnp.stack([getattr(episodes, name).astype(jnp.float32) for name in names])
     return dict(zip(names, jnp.mean(outcomes, axis=1, where=valid), strict=True))

@@ -32,6 +32,12 @@ class Vector:
     def __post_init__(self) -> None:
         if self.size < 1 or not -math.inf < self.low < self.high < math.inf:
             raise ValueError(f"Vector needs size >= 1 and finite low < high, got {self}")
+        if self.dtype != "float32":
+            if not np.issubdtype(self.dtype, np.integer):
+                raise ValueError(f"Vector stores float32 or whole numbers, got {self}")
+            held = np.iinfo(self.dtype)
+            if not held.min <= self.low < self.high <= held.max:
+                raise ValueError(f"Vector needs a dtype that holds low and high, {held.min} to {held.max}, got {self}")
 
     @property
     def scale(self) -> float:

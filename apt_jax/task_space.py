@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from apt_jax.specs import Obs, Params, Spec, param_struct
+from apt_jax import draws
+from apt_jax.specs import Obs, Params, Spec, Vector, param_struct
 
 
 class StepOutput(NamedTuple):
     """What one environment step returns; no field is batched.
 
     `obs` is the true observation after the step, also at an episode's end: the caller resets.  `terminated` (the MDP ended, no
-    bootstrap) and `truncated` (the horizon was reached, bootstrap) are never both true.
+    bootstrap) and `truncated` (the horizon was reached, bootstrap) are never both true.  An episode is a success if `success`
+    is true at any of its steps.
     """
 
     state: Any
@@ -46,7 +49,7 @@ class TaskSpace(Protocol):
     horizon: int
 
     def sample_uniform(self, key: Key[Array, ""]) -> Params:
-        """A task parameter drawn uniformly; consumes `key`."""
+        """A task parameter drawn uniformly, as by `sample_uniform` below; consumes `key`."""
         ...
 
     def instantiate(self, w: Params) -> Any:
@@ -71,6 +74,21 @@ class TaskSpace(Protocol):
         NaN says "not defined for this task"; means over tasks skip it.
         """
         ...
+
+
+def sample_uniform(spec: Spec, key: Key[Array, ""]) -> Params:
+    """Scores uniform in [0, 1): every category is equally likely.  Numbers uniform in their range.  Consumes `key`."""
+    struct = param_struct(spec)
+    w = {}
+    for (name, modality), key_block in zip(spec.items(), jax.random.split(key, len(spec)), strict=True):
+        low, high = (modality.low, modality.high) if isinstance(modality, Vector) else (0.0, 1.0)
+        w[name] = low + (high - low) * draws.uniform(key_block, struct[name].shape)
+    return w
+
+
+def over_environments(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of one environment, mapped over sources and environments: leaves [S, E, ...]."""
+    return jax.vmap(jax.vmap(function))
 
 
 def task_struct(space: TaskSpace) -> Any:

@@ -10,7 +10,8 @@ The caller batches over seeds and hyper-parameters and jits (`apt_jax.lanes`).  
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from functools import wraps
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +20,17 @@ from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import evaluation, learner, replay, workers
 from apt_jax.bonuses.base import Step
-from apt_jax.bonuses.none import no_update as no_bonus_update
 from apt_jax.checks import check_counts, check_sizes, check_space, check_target
 from apt_jax.config import Config, HParams
-from apt_jax.curricula.base import GENERATED, TARGET, Metrics, no_update
+from apt_jax.curricula.base import GENERATED, TARGET
 from apt_jax.methods import make_method
 from apt_jax.networks import QNetwork
+from apt_jax.plugin import Metrics, no_update
 from apt_jax.specs import Obs, Params
 from apt_jax.task_space import TaskSpace
 
 Carry = TypeVar("Carry")
+F = TypeVar("F", bound=Callable[..., Any])
 
 _REFRESH_STREAM = 1_000_033
 """Refreshing draws from a stream of its own, so that curricula which draw nothing there change nothing elsewhere."""
@@ -59,6 +61,11 @@ class TrainState(NamedTuple):
     replay: replay.Replay
     workers: workers.Workers
 
+    @property
+    def policy(self) -> Any:
+        """Parameters for `Trainer.act`: the averaged Q-network that the restore rule keeps, whose score is `target_return`."""
+        return self.kept.learner.target_params
+
 
 class Trainer(NamedTuple):
     """Pure, unbatched functions of one seed.
@@ -71,8 +78,9 @@ class Trainer(NamedTuple):
         while it is traced for a target that is not like the space's tasks.
       warmup: `warmup(state, clock, hparams) -> (state, clock)`: `Config.warmup_steps` of random actions, no updates.
       chunk: `chunk(state, clock, hparams) -> (state, clock, metrics)`: `Config.eval_every` steps, then an evaluation.
-      propose: `propose(state, key, n, hparams) -> w`: tasks the curriculum would generate now, leaves [n, ...]; consumes `key`.
-      act: `act(params, obs) -> action`: greedy, for observations with any leading axes.
+      propose: `propose(state, key, n, hparams) -> w`: tasks the curriculum would generate now, leaves [n, ...], for a Python
+        int n; consumes `key`.
+      act: `act(params, obs) -> action`: greedy, for `TrainState.policy` and observations with any leading axes.
     """
 
     space: TaskSpace
@@ -98,7 +106,7 @@ def make_trainer(space: TaskSpace, config: Config) -> Trainer:
     check_space(space)
     curriculum, bonus = make_method(space, config)
     sources = 2 if curriculum.generates else 1
-    learns = curriculum.update is not no_update or bonus.update is not no_bonus_update
+    learns = any(plugin.update is not no_update for plugin in (curriculum, bonus))
     check_sizes(config, sources, space.horizon, learns)
     network = QNetwork(space.obs_spec, space.num_actions)
     envs = config.envs_per_source
@@ -115,7 +123,7 @@ def make_trainer(space: TaskSpace, config: Config) -> Trainer:
         curriculum_state = curriculum.init(key_curriculum, hparams)
         environments = workers.start(space, assign(target, curriculum_state, key_assign, hparams), key_start)
         return TrainState(
-            target=jax.tree.map(jnp.asarray, target),
+            target=jax.tree.map(jnp.array, target),  # a copy: states are donated
             key=key,
             key_eval=key_eval,
             learner=learner_state,
@@ -124,7 +132,7 @@ def make_trainer(space: TaskSpace, config: Config) -> Trainer:
             bonus=bonus.init(key_bonus, environments.state, hparams),
             replay=replay.init(
                 space.obs_spec,
-                space.param_spec,
+                space.param_spec if curriculum.generates else {},
                 sources=sources,
                 envs=envs,
                 columns=config.replay_steps // envs,
@@ -269,7 +277,27 @@ def make_trainer(space: TaskSpace, config: Config) -> Trainer:
     def act(params: Any, obs: Obs) -> Int[Array, "..."]:
         return learner.greedy(network, params, obs)
 
-    return Trainer(space, config, curriculum.generates, init, warmup, chunk, propose, act)
+    return Trainer(
+        space=space,
+        config=config,
+        generates=curriculum.generates,
+        init=_in_float32(init),
+        warmup=_in_float32(warmup),
+        chunk=_in_float32(chunk),
+        propose=_in_float32(propose),
+        act=_in_float32(act),
+    )
+
+
+def _in_float32(function: F) -> F:
+    """Whole float32 products also where accelerators would round a matmul's inputs: values of actions differ by less."""
+
+    @wraps(function)
+    def precise(*args: Any) -> Any:
+        with jax.default_matmul_precision("highest"):
+            return function(*args)
+
+    return cast(F, precise)
 
 
 def _sources(rings: replay.Replay, window: int, since: int) -> Metrics:

@@ -10,14 +10,14 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from apt_jax.replay import Episode, Transition
 from apt_jax.specs import Obs, Params, param_struct, zeros_like
-from apt_jax.task_space import TaskSpace
+from apt_jax.task_space import TaskSpace, over_environments
 
 
 class Workers(NamedTuple):
     """Environments in the middle of their episodes; leaves [S, E, ...].
 
-    `w` is the parameter of the current task (zeros for the target), `played` counts the episodes finished on it; `length` and
-    `episode_return` are those of the current episode.
+    `w` is the parameter of the current task: zeros for the target, and without leaves where nothing is generated.  `played`
+    counts the episodes finished on it; `length`, `episode_return` and `success` (at any step) are those of the current episode.
     """
 
     state: Any
@@ -27,6 +27,7 @@ class Workers(NamedTuple):
     played: Int[Array, "S E"]
     length: Int[Array, "S E"]
     episode_return: Float[Array, "S E"]
+    success: Bool[Array, "S E"]
 
 
 class Assignment(NamedTuple):
@@ -39,9 +40,9 @@ class Assignment(NamedTuple):
 def assign(space: TaskSpace, target: Any, w: Params | None, envs: int) -> Assignment:
     """The target for source 0 and, if there is a generated source, tasks of `w` (leaves [E, ...]) for source 1."""
     targets = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, envs, *jnp.shape(x))), target)
-    no_w = zeros_like(param_struct(space.param_spec), (1, envs))
     if w is None:
-        return Assignment(targets, no_w)
+        return Assignment(targets, {})
+    no_w = zeros_like(param_struct(space.param_spec), (1, envs))
     generated = Assignment(jax.vmap(space.instantiate)(w), w)
     stacked = jax.tree.map(lambda x: x[None], generated)
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), Assignment(targets, no_w), stacked)
@@ -49,10 +50,18 @@ def assign(space: TaskSpace, target: Any, w: Params | None, envs: int) -> Assign
 
 def start(space: TaskSpace, assignment: Assignment, key: Key[Array, ""]) -> Workers:
     """All environments at the beginning of an episode; consumes `key`."""
-    shape = jax.tree.leaves(assignment.w)[0].shape[:2]
-    state, obs = _grid(space.reset)(jax.random.split(key, shape), assignment.task)
-    none = jnp.zeros(shape, jnp.int32)
-    return Workers(state, obs, assignment.task, assignment.w, none, none, jnp.zeros(shape))
+    shape = jax.tree.leaves(assignment.task)[0].shape[:2]
+    state, obs = over_environments(space.reset)(jax.random.split(key, shape), assignment.task)
+    return Workers(
+        state=state,
+        obs=obs,
+        task=assignment.task,
+        w=assignment.w,
+        played=jnp.zeros(shape, jnp.int32),
+        length=jnp.zeros(shape, jnp.int32),
+        episode_return=jnp.zeros(shape),
+        success=jnp.zeros(shape, bool),
+    )
 
 
 def step(
@@ -68,6 +77,8 @@ def step(
     """Step every environment; where its episode ends, reset it into its assigned task; consumes `key`.
 
     Args:
+      action: in [0, num_actions).
+      iteration: under which the step will be written to the replay.
       rollouts: episodes that a task is played for before an assignment replaces it.
 
     Returns:
@@ -77,7 +88,7 @@ def step(
     Raises:
       ValueError: while traced, if the space's step returns observations or a reward of another shape or dtype.
     """
-    out = _grid(space.step)(workers.state, action, workers.task)
+    out = over_environments(space.step)(workers.state, action, workers.task)
     _check_like(out.obs, workers.obs, f"{space.name}.step must return observations like reset")
     _check_like(out.reward, workers.episode_return, f"{space.name}.step must return a float32 reward")
     done = out.terminated | out.truncated
@@ -86,9 +97,10 @@ def step(
     transition = Transition(workers.obs, action, out.reward, out.obs, out.terminated, done)
     env = jnp.broadcast_to(jnp.arange(done.shape[1], dtype=jnp.int32), done.shape)
     end = jnp.broadcast_to(iteration, done.shape)
-    episode = Episode(workers.w, env, end, length, episode_return, out.success)
+    success = workers.success | out.success
+    episode = Episode(workers.w, env, end, length, episode_return, success)
 
-    going_on = Workers(out.state, out.obs, workers.task, workers.w, workers.played, length, episode_return)
+    going_on = workers._replace(state=out.state, obs=out.obs, length=length, episode_return=episode_return, success=success)
     if rollouts == 1:
         fresh = start(space, assignment, key)
     else:
@@ -113,8 +125,3 @@ def _where(condition: Bool[Array, "S E"], new: Any, old: Any) -> Any:
         return jnp.where(condition.reshape(*condition.shape, *(1,) * (new.ndim - 2)), new, old)
 
     return jax.tree.map(select, new, old)
-
-
-def _grid(function: Any) -> Any:
-    """Map over sources and environments."""
-    return jax.vmap(jax.vmap(function))

@@ -23,9 +23,11 @@ class BenchmarkSpace(TaskSpace, Protocol):
 
     Attributes:
       targets: text of each target task by name, for `parse_target`.
+      fps: steps per second at which a film of an episode is watched.
     """
 
     targets: Mapping[str, str]
+    fps: float
 
     def parse_target(self, text: str) -> Any:
         """The task that `text` describes; raises ValueError saying where the text is wrong."""
@@ -36,7 +38,7 @@ class BenchmarkSpace(TaskSpace, Protocol):
         ...
 
 
-SPACES: Mapping[str, Callable[[], BenchmarkSpace]] = {
+SPACES: dict[str, Callable[[], BenchmarkSpace]] = {
     "grid_world": grid_world.Space,
     "manipulation": manipulation.Space,
     "manipulation_sawyer": partial(manipulation.Space, arm="sawyer"),

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 
-def save_gif(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height width 3"]], fps: float = 5.0) -> None:
+def save_gif(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height width 3"]], fps: float) -> None:
     """Writes RGB `frames` of one size as an endless GIF at `fps` frames per second; overwrites `path`.
 
     GIF counts time in hundredths of a second, so above 100 frames per second viewers play it slower than asked.

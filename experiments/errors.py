@@ -11,10 +11,13 @@ class UsageError(Exception):
     """A request that cannot be fulfilled as given; the message says why and what would be."""
 
 
-def check_folder(file: Path | None) -> None:
-    """Raises a `UsageError` unless there is the directory that `file` is to be written to: before the work, not after it."""
-    if file and not file.parent.is_dir():
-        raise UsageError(f"{file.parent} is no directory")
+def make_folder(file: Path | None) -> None:
+    """Makes the directory that `file` is to be written to, before the work; raises a `UsageError` if there cannot be one."""
+    if file:
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"{file.parent} is no directory and cannot be made one: {error}") from error
 
 
 def exit_with(main: Callable[[], int]) -> None:

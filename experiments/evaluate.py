@@ -15,7 +15,7 @@ from rich.table import Table
 
 from apt_jax.evaluation import Outcome
 from experiments import episodes, film, runtime, settings
-from experiments.errors import UsageError, check_folder, exit_with
+from experiments.errors import UsageError, exit_with, make_folder
 from experiments.problem import make_problem
 from experiments.runner import load_lanes
 
@@ -55,7 +55,9 @@ def evaluate(args: Args) -> None:
     """Prints return and success of every lane."""
     if args.episodes < 1:
         raise UsageError(f"--episodes must be at least 1, got {args.episodes}")
-    check_folder(args.gif)
+    if args.robot and not args.gif:
+        raise UsageError("--robot plays the film's episode: say where to put it, --gif FILE")
+    make_folder(args.gif)
     experiment = settings.load(args.run_dir)
     if args.robot:
         film.check_robot(experiment.space)
@@ -65,7 +67,7 @@ def evaluate(args: Args) -> None:
         experiment = dataclasses.replace(experiment, target=target, target_file=file)
     problem = make_problem(experiment)
     states, clock, _ = load_lanes(args.run_dir, experiment, problem.trainer)
-    policies = jax.device_put(states.learner.target_params, jax.local_devices()[0])
+    policies = jax.device_put(states.policy, jax.local_devices()[0])
     key_score, key_film = jax.random.split(jax.random.key(args.seed))
     outcome = episodes.score(problem.trainer, policies, problem.target, episodes=args.episodes, key=key_score)
     names = [lane.name for lane in experiment.lanes]

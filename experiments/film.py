@@ -19,12 +19,9 @@ from envs.manipulation.solver import solve
 from envs.manipulation.targets import DEMONSTRATIONS
 from experiments import episodes, runtime
 from experiments.episodes import Episode
-from experiments.errors import UsageError, check_folder, exit_with
+from experiments.errors import UsageError, exit_with, make_folder
 from experiments.problem import load_target
 from experiments.settings import make_space, target_path
-
-FPS = 2.0
-"""Pushes per second of a film without the robot."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,7 @@ def main() -> int:
 
 def film(args: Args) -> None:
     """Writes a film of a shortest solution: the known one of a named target, else one that is searched for."""
-    check_folder(args.out)
+    make_folder(args.out)
     try:
         space = Space()
     except ValueError as error:
@@ -81,7 +78,7 @@ def save(out: Path, space: envs.BenchmarkSpace, task: Any, episode: Episode, *, 
     """Writes a film of an episode, played by the robot if asked for and this machine can draw it, else from above."""
     if robot and _save_robot(out, task, episode):
         return
-    envs.rendering.save_gif(out, [space.render(task, state) for state in episode.states], FPS)
+    envs.rendering.save_gif(out, [space.render(task, state) for state in episode.states], space.fps)
 
 
 def _save_robot(out: Path, task: Any, episode: Episode) -> bool:

@@ -28,9 +28,9 @@ from apt_jax.networks import QNetwork
 from apt_jax.replay import Episode, Replay
 from apt_jax.specs import Obs
 from apt_jax.trainer import Clock, Trainer, TrainState
-from experiments import runtime, settings
+from experiments import markdown, runtime, settings
 from experiments.errors import UsageError, exit_with
-from experiments.problem import make_problem
+from experiments.problem import check_apt_gen, make_problem
 from experiments.runner import load_lanes
 
 HEADER = (
@@ -89,9 +89,8 @@ def main() -> int:
         if getattr(args, name) < 1:
             raise UsageError(f"--{name} must be at least 1, got {getattr(args, name)}")
     experiment = settings.load(args.run_dir)
-    if not experiment.config.method.startswith("apt_gen"):
-        raise UsageError(f"{args.run_dir} is no run of apt_gen but of {experiment.config.method}")
     trainer = make_problem(experiment).trainer
+    check_apt_gen(trainer, args.run_dir)
     states, clock, hparams = jax.device_put(load_lanes(args.run_dir, experiment, trainer), jax.local_devices()[0])
     names = [lane.name for lane in experiment.lanes]
     print(f"{args.run_dir} after {int(clock.env_steps):,} steps; {args.periods} periods of {trainer.config.eval_every:,}\n")
@@ -156,15 +155,15 @@ def _compiled(trainer: Trainer, lanes: int) -> tuple[Program, Callable[..., Any]
 
 def table(names: list[str], periods: Foresight) -> str:
     """A line per lane, over all periods (leaves [P, L])."""
-    lines = [f"| {' | '.join(HEADER)} |", "|---" * len(HEADER) + "|"]
+    rows = []
     for lane, name in enumerate(names):
         of_lane = Foresight(*(values[:, lane] for values in periods))
         # A period without a fresh task has no mean.
         totals = (np.sum(np.where(of_lane.played > 0, x * of_lane.played, 0.0)) for x in of_lane[1:4])
         over_tasks = (total / max(of_lane.played.sum(), 1.0) if of_lane.played.any() else np.nan for total in totals)
         values = (*over_tasks, of_lane.averaged.mean(), of_lane.online.mean())
-        lines.append(f"| {name} | {of_lane.played.sum():.0f} | {' | '.join(f'{value:.2f}' for value in values)} |")
-    return "\n".join(lines)
+        rows.append((name, f"{of_lane.played.sum():.0f}", *(f"{value:.2f}" for value in values)))
+    return markdown.table(HEADER, rows)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,8 @@ from jaxtyping import Array, Float, Int, Key
 
 import envs
 from apt_jax.config import Config, HParams
-from apt_jax.curricula.base import GENERATED, Curriculum, Metrics, no_update
+from apt_jax.curricula.base import GENERATED, Curriculum
+from apt_jax.plugin import Metrics, no_update
 from apt_jax.replay import Replay, Rollouts, latest_episodes
 from apt_jax.specs import Params
 from apt_jax.task_space import TaskSpace
@@ -79,6 +80,8 @@ def move(task: Task, index: int, place: tuple[int, int]) -> Task:
 
 def make(space: TaskSpace, config: Config, *, target: str) -> Curriculum:
     """Climbs the ladder of the target called `target`, whatever task the run is aimed at."""
+    if space.name != "grid_world":
+        raise ValueError(f"a ladder is made of boards of grid_world, not for {space.name}")
     ladder = build(envs.load_target(space.name, target))
 
     def init(key: Key[Array, ""], hparams: HParams) -> Int[Array, ""]:

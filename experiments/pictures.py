@@ -88,4 +88,4 @@ def draw_policy(path: Path, experiment: Experiment, problem: Problem, policies: 
     best = int(np.argmax(curves["target_return"][:, -1]))
     policy = jax.tree.map(lambda x: x[best], policies)
     frames = episodes.film(problem.space, problem.trainer, policy, problem.target, jax.random.key(experiment.lanes[best].seed))
-    envs.rendering.save_gif(path / "policy.gif", frames)
+    envs.rendering.save_gif(path / "policy.gif", frames, problem.space.fps)

@@ -38,6 +38,9 @@ _TITLES = PANELS | {
 TOGETHER = 6
 """How many runs can be told apart in one panel."""
 
+NAMED = 10
+"""How many seeds are named in a legend; more are drawn without."""
+
 _MEAN_COLOUR = "black"
 _TARGET_COLOUR = "tab:green"
 
@@ -51,12 +54,13 @@ def learning_curves(file: Path, settings: Mapping[str, Run], *, delta: float | N
     """
     single = len(settings) == 1
     curves = next(iter(settings.values()))[1]
+    named = len(curves["seed"]) <= NAMED
     names = [name for name in PANELS if name in curves]
     figure = Figure(figsize=(4.2 * len(names), 3.6), layout="constrained")
     for axes, name in zip(np.atleast_1d(figure.subplots(1, len(names))), names, strict=True):
         for index, (setting, (env_steps, curves)) in enumerate(settings.items()):
             for seed, values in zip(curves["seed"][:, 0], curves[name], strict=True):
-                style: dict[str, Any] = {"label": f"seed {seed:g}"} if single else {"color": f"C{index}"}
+                style: dict[str, Any] = {"label": f"seed {seed:.10g}" if named else None} if single else {"color": f"C{index}"}
                 axes.plot(env_steps, values, marker=".", markersize=3, linewidth=1, alpha=0.6 if single else 0.25, **style)
             mean = np.ma.masked_invalid(curves[name]).mean(axis=0)
             colour = _MEAN_COLOUR if single else f"C{index}"

@@ -7,9 +7,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+
 import envs
 from apt_jax.checks import check_target
-from apt_jax.config import Config
+from apt_jax.config import Config, HParams
+from apt_jax.curricula.apt_gen import AptGenState
+from apt_jax.task_space import task_struct
 from apt_jax.trainer import Trainer, make_trainer
 from experiments.errors import UsageError
 from experiments.settings import Experiment, make_space
@@ -54,6 +58,14 @@ def make_problem(experiment: Experiment) -> Problem:
         raise UsageError(str(error)) from error
     check_env_steps(experiment.env_steps, experiment.config)
     return problem
+
+
+def check_apt_gen(trainer: Trainer, run: Path) -> None:
+    """Raises a `UsageError` unless the curriculum of a run is APT-Gen's, which has models to be asked."""
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    state = jax.eval_shape(trainer.init, key, task_struct(trainer.space), HParams())
+    if not isinstance(state.curriculum, AptGenState):
+        raise UsageError(f"{run} is no run of apt_gen but of {trainer.config.method}")
 
 
 def check_env_steps(env_steps: int, config: Config) -> None:

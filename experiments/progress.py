@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import timedelta
 from types import TracebackType
 from typing import Protocol
@@ -16,8 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
 from experiments import processes
-
-Metrics = Mapping[str, Float[np.ndarray, "S"]]
+from experiments.sinks import Metrics
 
 COLUMNS = {"target_return": "target return", "generated_episode_return": "generated return", "beta": "beta"}
 """The metrics shown, as far as a method has them."""
@@ -82,7 +81,7 @@ class LiveView:
 
     def note(self, text: str) -> None:
         """Above the live part."""
-        self._live.console.print(text, highlight=False, soft_wrap=True)
+        self._live.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def start(self, env_steps: int) -> None:
         """Starts the clock of the pace."""
@@ -121,7 +120,7 @@ class PlainView:
 
     def write(self, env_steps: int, metrics: Metrics) -> None:
         """Steps, pace and the mean over lanes of each shown metric."""
-        values = [f"{title} {metrics[name].mean():.3f}" for name, title in COLUMNS.items() if name in metrics]
+        values = [f"{title} {_mean(metrics[name]):.3f}" for name, title in COLUMNS.items() if name in metrics]
         self.note(f"{env_steps:,}/{self._total:,} steps, {self._pace.describe(env_steps)} | " + ", ".join(values))
 
     def stop(self) -> None:
@@ -166,5 +165,11 @@ def _table(lanes: Sequence[str], metrics: Metrics) -> Table:
     for i, lane in enumerate(lanes):
         table.add_row(lane, *(f"{metrics[name][i]:.3f}" for name in names))
     table.add_section()
-    table.add_row("mean", *(f"{metrics[name].mean():.3f}" for name in names))
+    table.add_row("mean", *(f"{_mean(metrics[name]):.3f}" for name in names))
     return table
+
+
+def _mean(values: Float[np.ndarray, "S"]) -> float:
+    """Over the lanes that have a value, NaN if none has: a lane may not have finished an episode yet."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else np.nan

@@ -9,9 +9,8 @@ from typing import Any
 
 import tyro
 
-import envs
 from experiments import film, pictures, plots, run_dir, runtime, settings
-from experiments.errors import UsageError, check_folder, exit_with
+from experiments.errors import UsageError, exit_with, make_folder
 from experiments.problem import import_plugins, load_target
 
 
@@ -44,13 +43,13 @@ def draw(args: Args) -> None:
     Raises:
       UsageError: no run, no tasks in it, no folder to write to, no robot in its space, or no OpenGL to draw it with.
     """
-    check_folder(args.out)
+    make_folder(args.out)
     experiment = settings.load(args.run_dir)
     if not run_dir.task_files(args.run_dir):
         raise UsageError(f"{args.run_dir} holds no generated tasks: its method generates none, or it has not begun to")
     import_plugins(experiment.plugins)
     target = load_target(experiment.space, experiment.target, experiment.target_file)
-    space = envs.make(experiment.space)
+    space = settings.make_space(experiment.space)
     picture: Callable[[Any], plots.Image] = space.render
     if args.robot:
         film.check_robot(experiment.space)

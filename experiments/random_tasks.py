@@ -8,9 +8,9 @@ from pathlib import Path
 import jax
 import tyro
 
-import envs
 from experiments import plots, runtime
-from experiments.errors import UsageError, check_folder, exit_with
+from experiments.errors import UsageError, exit_with, make_folder
+from experiments.settings import make_space
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,9 @@ def main() -> int:
     args = tyro.cli(Args, prog="python -m experiments.random_tasks")
     if min(args.rows, args.columns) < 1:
         raise UsageError(f"--rows and --columns must be at least 1, got {args.rows} and {args.columns}")
-    check_folder(args.out)
+    make_folder(args.out)
     runtime.setup()
-    try:
-        space = envs.make(args.space)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
+    space = make_space(args.space)
     keys = jax.random.split(jax.random.key(args.seed), args.rows * args.columns)
     tasks = jax.device_get(jax.jit(jax.vmap(lambda key: space.instantiate(space.sample_uniform(key))))(keys))
     pictures = [space.render(jax.tree.map(lambda x: x[i], tasks)) for i in range(len(keys))]  # noqa: B023

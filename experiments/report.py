@@ -10,9 +10,9 @@ import numpy as np
 import tyro
 from jaxtyping import Float, Int
 
-from experiments import plots, run_dir
+from experiments import markdown, plots, run_dir
 from experiments.aggregates import iqm, iqm_interval
-from experiments.errors import UsageError, exit_with
+from experiments.errors import UsageError, exit_with, make_folder
 
 SOLVED = 0.9
 """Target return from which a task counts as solved."""
@@ -51,9 +51,9 @@ def main() -> int:
     known = {metric for _, curves in runs.values() for metric in curves}
     if not report.metrics or not known.issuperset(report.metrics):
         raise UsageError(f"--metrics must be among {', '.join(sorted(known))}; got {', '.join(report.metrics) or 'none'}")
+    make_folder(report.figure)
     print(table(runs))
     if report.figure:
-        report.figure.parent.mkdir(parents=True, exist_ok=True)
         plots.comparison(report.figure, {"": runs}, metrics=report.metrics)
     return 0
 
@@ -90,16 +90,15 @@ def read_parts(name: str, paths: Sequence[Path]) -> dict[str, plots.Run]:
 
 def table(runs: dict[str, plots.Run]) -> str:
     """A Markdown table with a line per run."""
-    lines = [f"| {' | '.join(HEADER)} |", "|---" * len(HEADER) + "|"]
-    return "\n".join(lines + [row(name, env_steps, curves) for name, (env_steps, curves) in runs.items()])
+    return markdown.table(HEADER, [cells(name, env_steps, curves) for name, (env_steps, curves) in runs.items()])
 
 
-def row(name: str, env_steps: Int[np.ndarray, "T"], curves: run_dir.Curves) -> str:
+def cells(name: str, env_steps: Int[np.ndarray, "T"], curves: run_dir.Curves) -> tuple[str, ...]:
     """One line of the table; a dash where a seed never got there."""
     final, raw = curves["target_return"][:, -1], curves["target_return_raw"][:, -1]
     firsts = [first_above(env_steps, values) for values in curves["target_return_raw"]]
     low, high = iqm_interval(final)
-    cells = (
+    return (
         name,
         f"{env_steps[-1]:,}",
         f"{_numbers(final)} ({final.mean():.2f} ± {final.std():.2f})",
@@ -107,7 +106,6 @@ def row(name: str, env_steps: Int[np.ndarray, "T"], curves: run_dir.Curves) -> s
         _numbers(raw),
         " ".join("-" if step is None else f"{step / 1000:g}k" for step in firsts),
     )
-    return f"| {' | '.join(cells)} |"
 
 
 def first_above(env_steps: Int[np.ndarray, "T"], values: Float[np.ndarray, "T"]) -> int | None:

@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import os
@@ -192,12 +193,13 @@ def _check_header(file: Path, names: Sequence[str]) -> None:
 
 def _write_rows(file: Path, rows: Sequence[Mapping[str, object]], mode: str) -> None:
     names = list(rows[0])
-    with file.open(mode, newline="") as stream:
-        writer = csv.DictWriter(stream, fieldnames=names)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, fieldnames=names)
+    with file.open(f"{mode}b", buffering=0) as stream:
         if stream.tell() == 0:
             writer.writeheader()
         else:
             _check_header(file, names)
         writer.writerows(rows)
-        stream.flush()
+        stream.write(text.getvalue().encode())  # in one go: a process that is killed leaves all lanes' rows or none
         os.fsync(stream.fileno())

@@ -27,10 +27,10 @@ from apt_jax.curricula.apt_gen_objectives import make_objectives
 from apt_jax.networks import QNetwork, spectral_normalize
 from apt_jax.specs import Obs, Params
 from apt_jax.trainer import Trainer
-from experiments import runtime, settings
-from experiments.errors import UsageError, check_folder, exit_with
+from experiments import markdown, runtime, settings
+from experiments.errors import UsageError, exit_with, make_folder
 from experiments.ladder import Ladder, build
-from experiments.problem import make_problem
+from experiments.problem import check_apt_gen, make_problem
 from experiments.runner import load_lanes
 
 STEPS_SEEN = 16
@@ -75,26 +75,25 @@ class Judgement(NamedTuple):
 def main() -> int:
     """The command line."""
     args = tyro.cli(Args, prog="python -m experiments.rungs", description=__doc__)
-    check_folder(args.figure)
+    make_folder(args.figure)
     runtime.setup()
     if args.tasks < 1:
         raise UsageError(f"--tasks must be at least 1, got {args.tasks}")
     experiment = settings.load(args.run_dir)
-    if experiment.space != "grid_world" or not experiment.config.method.startswith("apt_gen"):
-        raise UsageError(
-            f"{args.run_dir} is no run of apt_gen on grid_world but of {experiment.config.method} on {experiment.space}"
-        )
+    if experiment.space != "grid_world":
+        raise UsageError(f"{args.run_dir} is no run on grid_world but on {experiment.space}")
     problem = make_problem(experiment)
-    ladder = build(problem.target)
+    check_apt_gen(problem.trainer, args.run_dir)
     states, clock, hparams = load_lanes(args.run_dir, experiment, problem.trainer)
+    ladder = build(problem.target)
     lanes = len(experiment.lanes)
-    policies, curricula = jax.device_put((states.learner.target_params, states.curriculum), jax.local_devices()[0])
+    policies, curricula = jax.device_put((states.policy, states.curriculum), jax.local_devices()[0])
     judged = judge(
         problem.trainer, policies, curricula, hparams, choose(ladder, args.tasks, args.seed), jax.random.key(args.seed)
     )
     judged = jax.tree.map(lambda x: np.asarray(x).reshape(lanes, len(ladder.steps), args.tasks), judged)
     print(f"{args.run_dir} after {int(clock.env_steps):,} steps; means over lanes and tasks\n")
-    print(table(ladder, judged))
+    print(table(ladder, judged), end="\n\n")
     print(correlations([lane.name for lane in experiment.lanes], ladder, judged))
     if args.figure:
         draw(args.figure, ladder, judged)
@@ -139,12 +138,12 @@ def judge(
 def table(ladder: Ladder, judged: Judgement) -> str:
     """A line per rung."""
     header = ("steps", "D's logit", "of solved tasks", "of failed tasks", "V1", "V2", "return", "solved")
-    lines = [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
+    rows = []
     for rung, steps in enumerate(ladder.steps):
         logit, progress, value, episode_return, success = (np.asarray(x[:, rung]) for x in judged)
         cells = [mean(x) for x in (logit, logit[success], logit[~success], progress, value, episode_return, success)]
-        lines.append(f"| {steps:.0f} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+        rows.append((f"{steps:.0f}", *cells))
+    return markdown.table(header, rows)
 
 
 def mean(values: Float[np.ndarray, "..."]) -> str:
@@ -159,12 +158,12 @@ def correlations(names: list[str], ladder: Ladder, judged: Judgement) -> str:
         return f"{stats.spearmanr(a.reshape(-1), b.reshape(-1)).statistic:+.2f}"
 
     header = ("lane", "D with the rung", "V1 with the rung", "V1 with D", "V2 with the return")
-    lines = [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
+    rows = []
     for name, logit, progress, value, episode_return, _ in zip(names, *judged, strict=True):
         rung = np.broadcast_to(ladder.steps[:, None], logit.shape)
         pairs = ((logit, rung), (progress, rung), (progress, logit), (value, episode_return))
-        lines.append(f"| {name} | {' | '.join(rank(*pair) for pair in pairs)} |")
-    return "\n".join(lines) + "\n"
+        rows.append((name, *(rank(*pair) for pair in pairs)))
+    return markdown.table(header, rows)
 
 
 def draw(file: Path, ladder: Ladder, judged: Judgement) -> None:

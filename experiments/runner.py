@@ -42,7 +42,6 @@ class Runner:
         target: Any,
         experiment: Experiment,
         layout: Layout,
-        at_once: int | None = None,
         programs: Programs | None = None,
     ):
         self._lanes = len(experiment.lanes)
@@ -50,7 +49,7 @@ class Runner:
         memory = runtime.device_memory()
         resident = None if memory is None else room(trainer, memory)
         try:
-            self._program = make_program(trainer, self._lanes, layout=layout, at_once=at_once, resident=resident)
+            self._program = make_program(trainer, self._lanes, layout=layout, resident=resident)
         except ValueError as error:
             raise UsageError(str(error)) from error
         self._keys, self._hparams = lane_inputs(experiment)
@@ -111,8 +110,8 @@ class Runner:
         return self._gather(self._propose(self._states, keys, n, hparams))
 
     def policies(self) -> Any:
-        """Averaged Q-network parameters, leaves [L, ...]: what evaluations judge."""
-        return self._gather(self._states.learner.target_params)
+        """Parameters of the kept policies, leaves [L, ...]."""
+        return self._gather(self._states.policy)
 
     def save(self, directory: Path) -> None:
         """A checkpoint of the lanes, as they are padded on these devices, and the clock."""

@@ -77,13 +77,11 @@ class Session:
     Attributes:
       run_dir: where everything is written; must be new, empty, or resumed.
       resume: go on from the run directory's checkpoint; the experiment defaults to what is saved there.
-      preset: the config and hparams to start from, by default paper or what a resumed run was started with, but for a gamma of
+      preset: the config and hparams to start from, by default fast or what a resumed run was started with, but for a gamma of
         the space's own and, with fast, what was tuned for the method; other options override single fields.
       method: short for --config.method: apt_gen, apt_gen_progress_only, apt_gen_return_only, random, alp_gmm, goal_gan, dqn,
         icm, rnd, ride, or one with a bonus added as in "apt_gen+rnd".
       layout: how the lanes of one device are laid out; by default map on CPU and vmap on accelerators.
-      at_once: with layout vmap, how many lanes of a device run at the same time, by default as many as fit its memory; layout
-        map, the one of CPUs, runs one at a time anyway.
       devices: devices the host CPU counts as, by default one per core; lanes are spread over them.
       distributed: this is one of several processes, each started with the same options, that share lanes and run directory; on
         SLURM, Open MPI, Kubernetes and TPU pods they find each other, elsewhere with the next three options.
@@ -99,7 +97,6 @@ class Session:
     preset: Preset | None = None
     method: str | None = None
     layout: Layout = "auto"
-    at_once: int | None = None
     devices: int | None = None
     distributed: bool = False
     coordinator_address: str | None = None
@@ -133,7 +130,7 @@ class _Basis:
     resume: bool = False
     preset: Preset | None = None
     method: str | None = None
-    config_method: Annotated[str, tyro.conf.arg(name="config.method")] = Config.method
+    config_method: Annotated[str | None, tyro.conf.arg(name="config.method")] = None
     space: str = Experiment.space
     target: str | None = None
     target_file: Path | None = None
@@ -150,9 +147,10 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
     saved = load(basis.run_dir) if basis.resume and basis.run_dir else None
     default = saved or Experiment()
     if basis.preset or not saved:
-        space, method = saved.space if saved else basis.space, basis.method or basis.config_method
-        config, hparams = starting_point(basis.preset or "paper", space, method)
-        default = dataclasses.replace(default, config=config, hparams=hparams)
+        space = saved.space if saved else basis.space
+        method = basis.method or basis.config_method or default.config.method
+        config, hparams = starting_point(basis.preset or "fast", space, method)
+        default = dataclasses.replace(default, config=dataclasses.replace(config, method=method), hparams=hparams)
 
     def train(
         session: Annotated[Session, tyro.conf.arg(name="")],
@@ -226,7 +224,7 @@ def check(experiment: Experiment, session: Session) -> None:
             check_hparams(lane.hparams)
         except ValueError as error:
             raise UsageError(f"--hparams: {error}") from error
-    for name in ("at_once", "devices", "checkpoint_every"):
+    for name in ("devices", "checkpoint_every"):
         value = getattr(session, name)
         if value is not None and value < 1:
             raise UsageError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
@@ -303,7 +301,7 @@ def _comparable(experiment: Experiment) -> dict[str, Any]:
     del fields["env_steps"]
     config, hparams = fields.pop("config"), fields.pop("hparams")
     if experiment.target_file:
-        fields["target_file"] = _read(experiment.target_file)
+        fields |= {"target": "of a file", "target_file": _read(experiment.target_file)}
     return {
         **fields,
         **{f"config.{name}": value for name, value in config.items()},

@@ -11,7 +11,7 @@ import tyro
 from jaxtyping import Float, Int
 
 from apt_jax.config import HParams
-from experiments import run_dir, settings
+from experiments import markdown, run_dir, settings
 from experiments.errors import UsageError, exit_with
 
 HEADER = (
@@ -73,25 +73,25 @@ def table(runs: Sequence[Path], *, after: int = Signs.after) -> str:
             raise UsageError(f"--after must be below the {env_steps[-1]:,} steps of {path}, got {after:,}")
         for i, lane in enumerate(experiment.lanes):
             own = {name: values[i] for name, values in curves.items()}
-            rows.append(row(path.name, lane.name.removeprefix("seed "), env_steps, own, after, lane.hparams))
-    return "\n".join((f"| {' | '.join(HEADER)} |", "|---" * len(HEADER) + "|", *rows))
+            rows.append(cells(path.name, lane.name.removeprefix("seed "), env_steps, own, after, lane.hparams))
+    return markdown.table(HEADER, rows)
 
 
-def row(
+def cells(
     name: str,
     lane: str,
     env_steps: Int[np.ndarray, "T"],
     curves: dict[str, Float[np.ndarray, "T"]],
     after: int,
     hparams: HParams,
-) -> str:
+) -> tuple[str, ...]:
     """One line of the table; a metric that the task space lacks is a dash."""
     late = env_steps > after
     returns = curves["generated_episode_return"][late]
     low, high = np.nanpercentile(returns, [10, 90])
     beta = curves["beta"][late]
     bounds = [np.mean(beta == getattr(hparams, bound)) for bound in ("beta_min", "beta_max")]
-    cells = (
+    return (
         name,
         lane,
         f"{np.nanmean(returns):.2f} ({low:.2f} to {high:.2f})",
@@ -104,7 +104,6 @@ def row(
         f"{np.nanmean(curves['v2_bias'][late]):+.2f}",
         error(curves["generator_return"][late], returns),
     )
-    return f"| {' | '.join(cells)} |"
 
 
 def error(expected: Float[np.ndarray, "T"], returned: Float[np.ndarray, "T"]) -> str:

@@ -20,11 +20,11 @@ from experiments.errors import UsageError, exit_with
 from experiments.interrupt import EXIT_CODE, Interrupt
 from experiments.problem import make_problem
 from experiments.programs import Programs
-from experiments.progress import Metrics, View, make_view
+from experiments.progress import View, make_view
 from experiments.run_dir import RunDir
 from experiments.runner import Runner
 from experiments.settings import Experiment, Session, parse
-from experiments.sinks import Sink, check_installed, make_sinks
+from experiments.sinks import Metrics, Sink, check_installed, make_sinks
 from experiments.summary import Times, is_complete, summarise
 
 T = TypeVar("T")
@@ -54,7 +54,7 @@ def train(experiment: Experiment, session: Session) -> int:
     check_installed(session.sinks)
     processes.check_same(repr((experiment, dataclasses.replace(session, process_id=None))))
     programs = kept_programs(experiment, session, problem.space)
-    runner = Runner(problem.trainer, problem.target, experiment, session.layout, session.at_once, programs)
+    runner = Runner(problem.trainer, problem.target, experiment, session.layout, programs)
     run = RunDir(session.run_dir)
     if session.resume and processes.from_first(lambda: is_complete(run.path, experiment)):
         if processes.is_first():
@@ -90,7 +90,7 @@ def kept_programs(experiment: Experiment, session: Session, space: envs.Benchmar
     """Programs are kept for one process whose task space and method come with this project: then all sources are known."""
     if session.distributed or experiment.plugins or not type(space).__module__.startswith(f"{envs.__name__}."):
         return Programs()
-    return Programs.of(experiment.space, experiment.config, len(experiment.lanes), session.layout, session.at_once)
+    return Programs.of(experiment.space, experiment.config, len(experiment.lanes), session.layout)
 
 
 def open_sinks(experiment: Experiment, session: Session, start: int) -> list[Sink]:
@@ -159,6 +159,7 @@ class Training:
         if self.runner.env_steps == 0 and self._unfinished():
             self._patiently(self.runner.warmup)
             self._sample_tasks()
+            self.runner.save(self.run_dir.checkpoints)
         self.view.start(self.runner.env_steps)
 
     def _unfinished(self) -> bool:

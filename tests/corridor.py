@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from apt_jax.specs import Grid, Vector
-from apt_jax.task_space import StepOutput
+from apt_jax.task_space import StepOutput, sample_uniform
 
 LENGTH = 9
 
@@ -31,11 +30,7 @@ class Corridor:
     horizon = 12
 
     def sample_uniform(self, key):
-        key_goal, key_paint = jax.random.split(key)
-        return {
-            "goal": jax.random.uniform(key_goal, (1,), maxval=LENGTH),
-            "paint": jax.random.uniform(key_paint, (4, 4, 2)),
-        }
+        return sample_uniform(self.param_spec, key)
 
     def instantiate(self, w):
         return jnp.clip(jnp.floor(w["goal"][0]).astype(jnp.int32), 1, LENGTH - 1)

@@ -16,7 +16,7 @@ from experiments.run_dir import RunDir
 from tests.corridor import Corridor
 
 OPTIONS = shlex.split(
-    """--space corridor --seeds 3 0 5 1 2 4 6 7 8 --env-steps 440 --config.warmup-steps 40 --config.eval-every 20
+    """--space corridor --preset paper --seeds 3 0 5 1 2 4 6 7 8 --env-steps 440 --config.warmup-steps 40 --config.eval-every 20
     --config.refresh-every 20 --config.replay-steps 60 --config.recent-steps 20 --config.replay-episodes 8
     --config.return-window 8 --config.updates-per-step 1 --config.batch-size 4 --config.eval-episodes 2
     --config.probe-tasks 2 --checkpoint-every 100 --devices 2"""

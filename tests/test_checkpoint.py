@@ -47,6 +47,13 @@ def test_only_the_latest_step_is_kept(tmp_path: Path) -> None:
     assert not (tmp_path / "10").exists()
 
 
+def test_a_step_that_is_not_new_is_refused(tmp_path: Path) -> None:
+    checkpoint.save(tmp_path, 20, make_tree())
+    for step in (10, 20):
+        with pytest.raises(checkpoint.CheckpointError, match=f"has a checkpoint of step 20, got step {step} to save"):
+            checkpoint.save(tmp_path, step, make_tree())
+
+
 def test_an_unfinished_save_leaves_the_previous_one(tmp_path: Path) -> None:
     checkpoint.save(tmp_path, 10, make_tree())
     shutil.copytree(tmp_path / "10", tmp_path / "20.orbax-checkpoint-tmp")

@@ -18,6 +18,7 @@ from envs.grid_world.placement import parameter, place
 from envs.grid_world.solver import solve
 from experiments import ladder, settings, train
 from experiments.problem import make_problem
+from tests.corridor import Corridor
 
 SPACE = envs.make("grid_world")
 PLUGIN = "experiments.ladder_methods"
@@ -33,6 +34,11 @@ def climbing():
 def test_a_target_is_made_of_its_parameter(name):
     target = envs.load_target("grid_world", name)
     jax.tree.map(np.testing.assert_array_equal, place(parameter(target)), target)
+
+
+def test_there_is_no_ladder_in_another_space():
+    with pytest.raises(ValueError, match="grid_world, not for corridor"):
+        ladder.make(Corridor(), Config(), target="A")
 
 
 def test_a_plug_in_adds_its_methods_to_a_run_and_is_remembered_by_it(tmp_path, monkeypatch):

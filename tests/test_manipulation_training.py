@@ -30,7 +30,7 @@ can 80 10
 range 30
 """
 OPTIONS = shlex.split(
-    """--space manipulation --method apt_gen --seeds 0 --env-steps 180 --devices 1 --config.envs-per-source 2
+    """--space manipulation --preset paper --method apt_gen --seeds 0 --env-steps 180 --devices 1 --config.envs-per-source 2
     --config.warmup-steps 60 --config.updates-per-step 1 --config.batch-size 8 --config.replay-steps 100
     --config.replay-episodes 16 --config.model-updates-per-step 0.25 --config.model-batch-size 4 --config.recent-steps 60
     --config.refresh-every 4 --config.eval-every 60 --config.eval-episodes 2 --config.probe-tasks 2 --config.return-window 4"""

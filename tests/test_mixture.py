@@ -96,10 +96,10 @@ def test_agrees_with_scikit_learn_for_every_number_of_components_at_once():
 
 def test_a_diagonal_covariance_has_no_other_entries():
     result = fit(ROWS, jnp.ones(10, bool), LABELS, jnp.int32(2), slots=3, regularisation=1e-3, diagonal=True)
-    factors = np.asarray(result.mixture.factors)
+    factors = np.asarray(result.mixture.scale_tril)
     np.testing.assert_array_equal(factors, factors * np.eye(3))
     full = fit(ROWS, jnp.ones(10, bool), LABELS, jnp.int32(2), slots=3, regularisation=1e-3)
-    assert np.any(np.asarray(full.mixture.factors) * (1 - np.eye(3)) != 0)
+    assert np.any(np.asarray(full.mixture.scale_tril) * (1 - np.eye(3)) != 0)
 
 
 def test_a_covariance_without_a_factor_gives_no_criterion():
@@ -121,7 +121,7 @@ def test_draws_have_the_components_mean_and_covariance():
     logits = jnp.array([-jnp.inf, 0.0, -jnp.inf, -jnp.inf])
     rows = jax.vmap(lambda key: draw(mixture, logits, key))(jax.random.split(jax.random.key(0), 20_000))
     np.testing.assert_allclose(rows.mean(0), mixture.means[1], atol=0.03)
-    np.testing.assert_allclose(np.cov(rows.T), mixture.factors[1] @ mixture.factors[1].T, atol=0.03)
+    np.testing.assert_allclose(np.cov(rows.T), mixture.scale_tril[1] @ mixture.scale_tril[1].T, atol=0.03)
 
 
 def test_k_means_tells_separate_clusters_apart():

@@ -126,7 +126,6 @@ def test_a_run_finds_what_another_of_its_kind_has_compiled(cache):
         (dataclasses.replace(experiment, config=Config(batch_size=64)), session),
         (dataclasses.replace(experiment, space="manipulation"), session),
         (experiment, dataclasses.replace(session, layout="vmap")),
-        (experiment, dataclasses.replace(session, at_once=2)),
     ]
     assert [found(kept(*kind)) for kind in kinds] == [False] * len(kinds)
     assert all(found(kept(*kind)) for kind in kinds)

@@ -27,6 +27,16 @@ def test_a_terminal_shows_every_lane_and_notes_stay():
     assert text.rstrip().endswith("after the last picture")
 
 
+def test_brackets_in_a_note_are_no_markup_and_a_lane_without_a_value_is_left_out_of_the_mean():
+    screen = io.StringIO()
+    with progress.LiveView(["seed 0", "seed 5"], 1000, Console(file=screen, force_terminal=True, width=120)) as view:
+        view.note("into runs/A[fast]")
+        view.start(100)
+        view.write(600, {"generated_episode_return": np.array([np.nan, 0.625])})
+    assert "into runs/A[fast]" in screen.getvalue()
+    assert screen.getvalue().count("0.625") == 2
+
+
 def test_a_log_gets_one_line_an_evaluation(capsys):
     with progress.PlainView(1000) as view:
         view.start(0)

@@ -9,7 +9,7 @@ import pytest
 
 from apt_jax.config import HParams
 from experiments import report, signs
-from experiments.errors import UsageError, check_folder
+from experiments.errors import UsageError, make_folder
 
 
 def test_over_time_takes_the_mean_of_the_five_values_up_to_each_quarter_and_skips_gaps():
@@ -31,8 +31,9 @@ def test_a_row_averages_what_lies_after_the_given_step():
         "v2_bias": np.where(late, 0.1, 9.0),
         "generator_return": np.where(late, 0.25, 9.0),
     }
-    row = signs.row("run", "3", env_steps, curves, 4_000, HParams(beta_min=0.125, beta_max=8.0))
-    assert row == "| run | 3 | 0.50 (0.50 to 0.50) | 50%, 25% | - | - | - | - | 0.25 | -0.50 | +0.10 | -0.25 (0.25; nan) |"
+    cells = signs.cells("run", "3", env_steps, curves, 4_000, HParams(beta_min=0.125, beta_max=8.0))
+    assert cells[:4] == ("run", "3", "0.50 (0.50 to 0.50)", "50%, 25%")
+    assert cells[4:] == ("-", "-", "-", "-", "0.25", "-0.50", "+0.10", "-0.25 (0.25; nan)")
 
 
 def test_runs_of_one_name_are_not_mixed_up(tmp_path):
@@ -51,8 +52,10 @@ def test_no_run_is_a_mistake(module, monkeypatch):
         module.main()
 
 
-def test_a_missing_folder_is_told(tmp_path):
-    check_folder(None)
-    check_folder(tmp_path / "new.png")
-    with pytest.raises(UsageError, match="nowhere is no directory"):
-        check_folder(tmp_path / "nowhere" / "new.png")
+def test_folders_are_made_and_what_cannot_be_one_is_told(tmp_path):
+    make_folder(None)
+    make_folder(tmp_path / "new" / "deep" / "picture.png")
+    assert (tmp_path / "new" / "deep").is_dir()
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="file is no directory"):
+        make_folder(tmp_path / "file" / "picture.png")

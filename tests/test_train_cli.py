@@ -30,7 +30,7 @@ from experiments.settings import Experiment, Session
 ROOT = Path(__file__).parents[1]
 
 TINY = shlex.split(
-    """--method random --seeds 3 0 5 --env-steps 1200 --config.warmup-steps 200 --config.eval-every 100
+    """--preset paper --method random --seeds 3 0 5 --env-steps 1200 --config.warmup-steps 200 --config.eval-every 100
     --config.refresh-every 100 --config.replay-steps 400 --config.recent-steps 200 --config.replay-episodes 50
     --config.updates-per-step 1 --config.batch-size 4 --config.eval-episodes 2 --config.probe-tasks 2"""
 )
@@ -52,7 +52,6 @@ def start_run(path: Path, *options: str) -> Experiment:
         ("--hparams.delta 0.1 0.1", "--hparams.delta needs .* different numbers, got 0.1 0.1"),
         ("--hparams.delta nan", "delta must be finite, got nan"),
         ("--hparams.gamma 0.9 1.5", "gamma must be in .* got 1.5"),
-        ("--at-once 0", "--at-once must be at least 1"),
         ("--method apt_gen+rdn", "closest is 'rnd'"),
         ("--devices 0", "--devices must be at least 1"),
         ("--num-processes 2", "--num-processes and --process-id need --distributed"),
@@ -63,6 +62,9 @@ def start_run(path: Path, *options: str) -> Experiment:
         ("--env-steps 10000", r"warmup_steps \(10000\) .* is 11000"),
         ("--env-steps 2147484000", r"--env-steps must be below 2\^31, got 2147484000"),
         ("--hparams.learning-rate inf", "learning_rate must be finite and at least 0, got inf"),
+        ("--hparams.beta-max inf", "beta_max must be finite and above 0, got inf"),
+        ("--hparams.delta 1e300", "delta must be finite, got 1e\\+300"),
+        ("--hparams.epsilon-steps 1e-50", "epsilon_steps must be above 0, got 1e-50"),
         ("--hparams.beta-min 9", "beta_min must be at most beta_max=8, got 9"),
         ("--hparams.value-weight-decay 5000", "value_learning_rate .* at most 1, got 1.5"),
         ("--method alp_gmm --config.refresh-every 0", "refresh_every must be at least 1, got 0"),
@@ -149,7 +151,7 @@ def test_several_values_are_a_sweep_over_every_seed(tmp_path):
     assert len(lanes) == 35
     assert lanes[6].index == {"seed": 1, "delta": 0.1}
     assert lanes[6].name == "seed 1, delta 0.1"
-    assert lanes[6].hparams == HParams(delta=0.1, gamma=0.9)
+    assert lanes[6].hparams == PRESETS["fast"][1].replace(delta=0.1, gamma=0.9)
     assert settings.load(tmp_path) == experiment
     assert settings.parse(["--run-dir", str(tmp_path), "--resume"])[0] == experiment
     with pytest.raises(UsageError, match=r"hparams.delta \(saved \(-0.1, .*, asked 0.5\)"):
@@ -195,6 +197,11 @@ def test_resuming_defaults_to_the_saved_experiment(tmp_path):
     assert longer == dataclasses.replace(saved, env_steps=3000)
 
 
+def test_a_preset_named_again_keeps_the_method(tmp_path):
+    saved = start_run(tmp_path, "--preset", "fast", "--method", "dqn")
+    assert settings.parse(["--run-dir", str(tmp_path), "--resume", "--preset", "fast"])[0] == saved
+
+
 def test_resuming_names_every_difference(tmp_path):
     start_run(tmp_path, *TINY)
     options = "--resume --config.batch-size 8 --hparams.delta 0.3 --target B"
@@ -225,6 +232,9 @@ def test_a_target_file_named_again_is_the_one_that_the_run_has_kept(tmp_path):
     start_run(tmp_path / "run", "--target", str(file))
     resume = ["--run-dir", str(tmp_path / "run"), "--resume", "--target", str(file)]
     assert settings.parse(resume)[0].target == str(file)
+    copy = tmp_path / "copy.txt"
+    copy.write_text("first")
+    settings.parse([*resume[:-1], str(copy)])
     file.write_text("second")
     with pytest.raises(UsageError, match=r"target_file \(saved first, asked second\)"):
         settings.parse(resume)
@@ -348,5 +358,6 @@ def rows(path: Path) -> list[tuple[int, int]]:
         return [(int(row["seed"]), int(row["env_steps"])) for row in csv.DictReader(stream)]
 
 
-def test_the_default_config_is_the_papers():
+def test_the_librarys_default_is_the_papers_and_the_command_lines_is_what_learns(tmp_path):
     assert Experiment().config == Config() == PRESETS["paper"][0]
+    assert settings.parse(["--run-dir", str(tmp_path)])[0].config == PRESETS["fast"][0]

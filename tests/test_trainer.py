@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,14 @@ import pytest
 from jax.sharding import PartitionSpec
 
 import envs
-from apt_jax import checkpoint
+from apt_jax import checkpoint, workers
 from apt_jax.bonuses import BONUSES
 from apt_jax.config import PRESETS, Config, HParams
 from apt_jax.descent import has_learned
 from apt_jax.evaluation import diversity
 from apt_jax.lanes import _spread, lane_bytes, make_program, room, stack_hparams, stack_targets
 from apt_jax.methods import METHODS, Method, parse_method
+from apt_jax.specs import Vector
 from apt_jax.task_space import task_struct
 from apt_jax.trainer import Clock, make_trainer
 from tests.corridor import Corridor
@@ -193,6 +194,43 @@ def test_64_bits_are_refused():
         make_trainer(SPACE, CONFIG)
 
 
+def test_a_space_may_compute_with_weak_dtypes():
+    class Weak(Corridor):
+        obs_spec: ClassVar = {"position": Vector(1, 0, 1)}
+
+        def _observe(self, position, goal):
+            return {"position": jnp.where(position == goal, 1.0, 0.0)[None]}
+
+    make_trainer(Weak(), config("dqn"))
+
+
+def test_a_vector_of_a_dtype_that_cannot_hold_it_is_refused():
+    for dtype, words in (("uint8", "holds low and high, 0 to 255"), ("float16", "float32 or whole numbers")):
+        with pytest.raises(ValueError, match=words):
+            Vector(1, 0, 300, dtype)
+
+
+def test_an_episode_is_a_success_if_any_of_its_steps_is():
+    class Passing(Corridor):
+        """Success does not end an episode."""
+
+        def step(self, state, action, task):
+            out = super().step(state, action, task)
+            return out._replace(terminated=jnp.bool(False), truncated=out.state.steps >= self.horizon)
+
+    space = Passing()
+    current = workers.start(space, workers.assign(space, jnp.int32(1), None, 1), jax.random.key(0))
+    flags = []
+    for step in range(space.horizon):
+        key = jax.random.key(1 + step)
+        assignment = workers.assign(space, jnp.int32(1), None, 1)
+        action = jnp.full((1, 1), step == 0, jnp.int32)  # one step to the goal, then back and against the wall
+        current, _, _, episode, done = workers.step(space, current, action, assignment, jnp.int32(step), key)
+        flags.append((bool(episode.success[0, 0]), bool(done[0, 0])))
+    assert flags == [(True, False)] * (space.horizon - 1) + [(True, True)]
+    assert not current.success.any()
+
+
 def test_hparams_out_of_range_are_refused():
     with pytest.raises(ValueError, match=r"gamma must be in \[0, 1\], got 1.5"):
         stack_hparams([HParams(), HParams(gamma=1.5)])
@@ -252,20 +290,9 @@ def test_a_seed_of_another_method_is_the_same_beside_any_other(method, layout):
     assert_lane_equal(first, 1, jax.tree.map(lambda x: x[:1], second))
 
 
-def test_lanes_may_be_laid_out_in_groups():
-    """Five lanes on two devices, two at once on each."""
-    trainer = make_trainer(SPACE, config("dqn"))
-    lanes = stack_hparams([HParams()] * 5)
-
-    def states(**options):
-        compiled = make_program(trainer, 5, layout="vmap", **options)
-        keys = jax.vmap(jax.random.key)(np.arange(5))
-        return compiled.warmup(compiled.init(keys, targets(5), lanes), Clock.start(), lanes)[0]
-
-    for a, b in zip(leaves(states(at_once=2)), leaves(states()), strict=True):
-        np.testing.assert_allclose(a[:5], b[:5], rtol=1e-4, atol=1e-5)
-    with pytest.raises(ValueError, match="at least one lane and one at once, got 5 and 0"):
-        make_program(trainer, 5, at_once=0)
+def test_a_program_needs_lanes():
+    with pytest.raises(ValueError, match="at least one lane, got 0"):
+        make_program(make_trainer(SPACE, config("dqn")), 0)
 
 
 class Device(NamedTuple):
@@ -378,7 +405,7 @@ def test_an_unsolved_run_resets_its_q_function_and_nothing_else():
     assert (states.kept.score < 0).all(), "the target must be unsolved"
     assert [metrics["reset"].tolist() for metrics in history] == [[0, 0], [0, 1]]
     assert has_learned(states.learner.opt_state).tolist() == [True, False]
-    for leaf in leaves((states.replay, states.workers, states.kept)):
+    for leaf in leaves((states.replay, states.workers, states.kept, states.policy)):
         np.testing.assert_array_equal(leaf[0], leaf[1])
 
 

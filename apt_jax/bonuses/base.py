@@ -13,11 +13,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from apt_jax.config import Config, HParams
+from apt_jax.plugin import Metrics, UpdateFn
 from apt_jax.replay import Batch, Replay, Transition, sample_transitions
 from apt_jax.specs import Obs
 from apt_jax.task_space import TaskSpace
-
-Metrics = dict[str, Float[Array, ""]]
 
 
 class Step(NamedTuple):
@@ -61,14 +60,6 @@ class RewardFn(Protocol):
     """`reward(state, batch, hparams) -> (reward, metrics)`: what to train on, the bonus added, for any leading axes."""
 
     def __call__(self, state: Any, batch: Batch, hparams: HParams) -> tuple[Float[Array, "..."], Metrics]: ...
-
-
-class UpdateFn(Protocol):
-    """`update(state, key, replay, iteration, hparams) -> (state, metrics)`: one round of learning; consumes `key`."""
-
-    def __call__(
-        self, state: Any, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
-    ) -> tuple[Any, Metrics]: ...
 
 
 class ReturnRangeFn(Protocol):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Key
 
-from apt_jax.bonuses.base import Bonus, Metrics, Step
+from apt_jax.bonuses.base import Bonus, Step
 from apt_jax.config import Config, HParams
+from apt_jax.plugin import Metrics, no_update
 from apt_jax.replay import Batch, Replay
 from apt_jax.task_space import TaskSpace
 
@@ -33,11 +34,3 @@ def make(space: TaskSpace, config: Config) -> Bonus:
         return replay.returns.bounds()
 
     return Bonus((), init, annotate, reward, no_update, return_range)
-
-
-def no_update(
-    state: Any, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
-) -> tuple[Any, Metrics]:
-    """The `update` of a bonus that does not learn."""
-    del key, replay, iteration, hparams
-    return state, {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,19 +9,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from apt_jax.bonuses.base import Bonus, Metrics, Step, Steps, Stream, leading, pay, sample
+from apt_jax.bonuses.base import Bonus, Step, Steps, Stream, leading, pay, sample
 from apt_jax.bonuses.icm import losses
 from apt_jax.config import Config, HParams
 from apt_jax.descent import ADAM, adam_step, has_learned
 from apt_jax.networks import Dynamics
 from apt_jax.networks.apply import apply
+from apt_jax.plugin import Metrics
 from apt_jax.replay import Batch, Replay
 from apt_jax.specs import obs_struct, zeros_like
-from apt_jax.task_space import TaskSpace
+from apt_jax.task_space import TaskSpace, over_environments
 
 FORWARD_WEIGHT = 10.0
 INVERSE_WEIGHT = 0.1
-"""Of the two losses that the embedding learns from: the cross-entropy and half the squared error, as ICM has them."""
+"""Of the two losses that the embedding learns from: the cross-entropy and half the squared error, as ICM has them.
+
+The reference has the error's norm, so that its weights mean something else.
+"""
 
 
 class Visits(NamedTuple):
@@ -96,11 +99,6 @@ def make(space: TaskSpace, config: Config) -> Bonus:
         return state.stream.bounds(replay)
 
     return Bonus(jax.ShapeDtypeStruct((), jnp.float32), init, annotate, reward, update, return_range)
-
-
-def over_environments(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Map over sources and environments."""
-    return jax.vmap(jax.vmap(function))
 
 
 def impact(phi: Float[Array, "*batch d"], next_phi: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:

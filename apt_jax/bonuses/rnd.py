@@ -9,13 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from apt_jax.bonuses.base import Bonus, Metrics, Step, Steps, Stream, leading, pay, sample
+from apt_jax.bonuses.base import Bonus, Step, Steps, Stream, leading, pay, sample
 from apt_jax.bonuses.moments import Moments
 from apt_jax.config import Config, HParams
 from apt_jax.descent import ADAM, adam_step, has_learned
 from apt_jax.networks import Distillation
 from apt_jax.networks.apply import apply
 from apt_jax.networks.encoders import Features, observation_features
+from apt_jax.plugin import Metrics
 from apt_jax.replay import Batch, Replay
 from apt_jax.specs import Obs, obs_struct, zeros_like
 from apt_jax.task_space import TaskSpace

@@ -17,8 +17,9 @@ from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import replay as rp
 from apt_jax.config import Config, Covariance, HParams
-from apt_jax.curricula.base import GENERATED, Curriculum, Metrics, no_update
+from apt_jax.curricula.base import GENERATED, Curriculum
 from apt_jax.curricula.mixture import Mixture, draw, fit, k_means
+from apt_jax.plugin import Metrics, no_update
 from apt_jax.specs import Params, block_weights, flatten, unflatten
 from apt_jax.task_space import TaskSpace
 

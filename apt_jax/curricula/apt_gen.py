@@ -14,11 +14,12 @@ from apt_jax import draws
 from apt_jax import replay as rp
 from apt_jax.config import BetaRule, Config, HParams
 from apt_jax.curricula.apt_gen_objectives import make_objectives, task_progress
-from apt_jax.curricula.base import GENERATED, TARGET, Curriculum, Metrics
+from apt_jax.curricula.base import GENERATED, TARGET, Curriculum
 from apt_jax.descent import ADAM, descend
 from apt_jax.losses import adapt_beta, proportional_beta
 from apt_jax.networks import init_singular_vectors, spectral_normalize
 from apt_jax.networks.apply import apply
+from apt_jax.plugin import Metrics
 from apt_jax.specs import Params, Spec, Vector, obs_struct, param_struct, zeros_like
 from apt_jax.task_space import TaskSpace
 

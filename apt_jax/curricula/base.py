@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Int, Key
 
 from apt_jax.config import HParams
+from apt_jax.plugin import Metrics, UpdateFn
 from apt_jax.replay import Replay, Rollouts
 from apt_jax.specs import Params
 
 TARGET, GENERATED = 0, 1
 """Indices of the sources along the leading axis of replay and workers."""
-
-Metrics = dict[str, Float[Array, ""]]
 
 
 class InitFn(Protocol):
@@ -26,17 +25,6 @@ class ProposeFn(Protocol):
     """`propose(state, key, n, hparams) -> w`: `n` task parameters, leaves [n, ...]; consumes `key`."""
 
     def __call__(self, state: Any, key: Key[Array, ""], n: int, hparams: HParams) -> Params: ...
-
-
-class UpdateFn(Protocol):
-    """`update(state, key, replay, iteration, hparams) -> (state, metrics)`: one round of learning; consumes `key`.
-
-    `iteration` is the latest one written to the replay.
-    """
-
-    def __call__(
-        self, state: Any, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
-    ) -> tuple[Any, Metrics]: ...
 
 
 class RefreshFn(Protocol):
@@ -54,6 +42,8 @@ class RefreshFn(Protocol):
 class ReportFn(Protocol):
     """`report(state, rollouts, hparams) -> metrics`: judge the state on fresh tasks, played by the averaged policy with
     today's exploration (the online one collects).
+
+    `rollouts` has `Config.probe_tasks` of them, each with as many steps as the horizon, drawn with replacement.
     """
 
     def __call__(self, state: Any, rollouts: Rollouts, hparams: HParams) -> Metrics: ...
@@ -73,14 +63,6 @@ class Curriculum(NamedTuple):
     refresh: RefreshFn
     report: ReportFn
     rollouts: int = 1
-
-
-def no_update(
-    state: Any, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
-) -> tuple[Any, Metrics]:
-    """The `update` of a curriculum that does not learn."""
-    del key, replay, iteration, hparams
-    return state, {}
 
 
 def no_refresh(state: Any, key: Key[Array, ""], replay: Replay, iterations: Int[Array, ""], hparams: HParams) -> Any:

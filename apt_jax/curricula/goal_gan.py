@@ -16,10 +16,11 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from apt_jax import draws
 from apt_jax import replay as rp
 from apt_jax.config import Config, HParams
-from apt_jax.curricula.base import GENERATED, Curriculum, Metrics
+from apt_jax.curricula.base import GENERATED, Curriculum
 from apt_jax.descent import descend
 from apt_jax.losses import lsgan_discriminator_loss, lsgan_generator_loss
 from apt_jax.networks.apply import apply
+from apt_jax.plugin import Metrics
 from apt_jax.specs import Params, block_weights, flatten, unflatten
 from apt_jax.task_space import TaskSpace
 

@@ -26,7 +26,7 @@ class Mixture(NamedTuple):
 
     weights: Float[Array, "K"]
     means: Float[Array, "K D"]
-    factors: Float[Array, "K D D"]
+    scale_tril: Float[Array, "K D D"]
 
 
 class Fit(NamedTuple):
@@ -103,7 +103,7 @@ def log_density(mixture: Mixture, x: Float[Array, "N D"]) -> Float[Array, "N K"]
         log_determinant = jnp.sum(jnp.log(jnp.diagonal(factor)))
         return -0.5 * (x.shape[1] * jnp.log(2 * jnp.pi) + jnp.sum(whitened**2, axis=0)) - log_determinant
 
-    return jax.vmap(component)(mixture.means, mixture.factors).T
+    return jax.vmap(component)(mixture.means, mixture.scale_tril).T
 
 
 def invert_lower(lower: Float[Array, "D D"]) -> Float[Array, "D D"]:
@@ -111,15 +111,22 @@ def invert_lower(lower: Float[Array, "D D"]) -> Float[Array, "D D"]:
 
     In matmuls alone: a triangular solve in a `while_loop` hangs when two CPU devices run it at once (jax 0.10.2).
     """
-    at = np.arange(lower.shape[0])
-    inverse = jnp.diag(1.0 / jnp.diagonal(lower))
-    size = 1
-    while size < at.size:
-        half, whole = at // size, at // (2 * size)
-        below = (whole[:, None] == whole[None, :]) & (half[:, None] > half[None, :])
-        inverse = inverse - inverse @ jnp.where(below, lower, 0.0) @ inverse
-        size *= 2
-    return inverse
+    rows = lower.shape[0]
+    lower = jnp.eye(1 << (rows - 1).bit_length(), dtype=lower.dtype).at[:rows, :rows].set(lower)
+    inverses = (1.0 / jnp.diagonal(lower))[:, None, None]  # of the blocks along the diagonal
+    while inverses.shape[0] > 1:
+        pairs, size = inverses.shape[0] // 2, inverses.shape[1]
+        at = np.arange(pairs)
+        below = lower.reshape(pairs, 2, size, pairs, 2, size)[at, 1, :, at, 0, :]
+        first, second = inverses[0::2], inverses[1::2]
+        inverses = jnp.concatenate(
+            (
+                jnp.concatenate((first, jnp.zeros_like(first)), axis=2),
+                jnp.concatenate((-second @ below @ first, second), axis=2),
+            ),
+            axis=1,
+        )
+    return inverses[0, :rows, :rows]
 
 
 def draw(mixture: Mixture, logits: Float[Array, "K"], key: Key[Array, ""]) -> Float[Array, "D"]:
@@ -127,7 +134,7 @@ def draw(mixture: Mixture, logits: Float[Array, "K"], key: Key[Array, ""]) -> Fl
     key_component, key_normal = jax.random.split(key)
     component = jax.random.categorical(key_component, logits)
     mean = mixture.means[component]
-    return mean + mixture.factors[component] @ jax.random.normal(key_normal, mean.shape, mean.dtype)
+    return mean + mixture.scale_tril[component] @ jax.random.normal(key_normal, mean.shape, mean.dtype)
 
 
 def k_means(x: Float[Array, "N D"], valid: Bool[Array, "N"], k: Int[Array, ""], key: Key[Array, ""], *, slots: int) -> Array:

@@ -7,7 +7,8 @@ from typing import Any
 from jaxtyping import Array, Key
 
 from apt_jax.config import Config, HParams
-from apt_jax.curricula.base import Curriculum, no_refresh, no_report, no_update
+from apt_jax.curricula.base import Curriculum, no_refresh, no_report
+from apt_jax.plugin import no_update
 from apt_jax.specs import Params
 from apt_jax.task_space import TaskSpace
 

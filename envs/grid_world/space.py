@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt8
 
-from apt_jax import draws
-from apt_jax.specs import Obs, Params, Spec, param_struct
-from apt_jax.task_space import StepOutput
+from apt_jax.specs import Obs, Params, Spec
+from apt_jax.task_space import StepOutput, sample_uniform
 from envs.grid_world import dynamics
-from envs.grid_world.board import BOARD, GOAL, LAVA, WALL, Task
+from envs.grid_world.board import GOAL, LAVA, WALL, Task
 from envs.grid_world.dynamics import HORIZON, MOVES, State
 from envs.grid_world.layout import parse_layout
 from envs.grid_world.observation import OBS_SPEC, observe
@@ -28,6 +26,7 @@ class Space:
 
     Attributes:
       targets: layout of each target task by name, for `parse_target`.
+      fps: steps per second at which a film of an episode is watched.
     """
 
     name: str = "grid_world"
@@ -36,15 +35,11 @@ class Space:
     num_actions: int = len(MOVES)
     horizon: int = HORIZON
     targets: Mapping[str, str] = TARGETS
+    fps: float = 5.0
 
     def sample_uniform(self, key: Key[Array, ""]) -> Params:
-        """Tile scores uniform in [0, 1), so that every category is equally likely, and coordinates uniform in [0, 10)."""
-        key_tiles, key_xy = jax.random.split(key)
-        struct = param_struct(self.param_spec)
-        return {
-            "tiles": draws.uniform(key_tiles, struct["tiles"].shape),
-            "xy": jax.random.uniform(key_xy, struct["xy"].shape, maxval=BOARD),
-        }
+        """Every category of a tile and every place of an object equally likely; consumes `key`."""
+        return sample_uniform(self.param_spec, key)
 
     def instantiate(self, w: Params) -> Task:
         """The task of parameter `w`; see `placement` for the rules."""

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt8
 
-from apt_jax.specs import Obs, Params, Spec, Vector, param_struct
-from apt_jax.task_space import StepOutput
+from apt_jax.specs import Obs, Params, Spec
+from apt_jax.task_space import StepOutput, sample_uniform
 from envs.manipulation import arms, dynamics, scene
 from envs.manipulation.dynamics import HORIZON, State
 from envs.manipulation.layout import parse_table
@@ -26,6 +26,7 @@ class Space:
 
     Attributes:
       targets: text of each target task by name, for `parse_target`.
+      fps: pushes per second at which a film of an episode is watched, without the robot.
       goal_jitter: metres along x and y within which an episode's goal is drawn about the task's, in all tasks alike.
       arm: what pushes the cans, a name of `arms.ARMS`.
 
@@ -39,6 +40,7 @@ class Space:
     num_actions: int = CANS * len(DIRECTIONS)
     horizon: int = HORIZON
     targets: Mapping[str, str] = TARGETS
+    fps: float = 2.0
 
     def __init__(self, goal_jitter: float = 0.03, arm: str = "tool"):
         scene.check_drawing()
@@ -47,13 +49,8 @@ class Space:
         self._arm = arms.arm(arm)
 
     def sample_uniform(self, key: Key[Array, ""]) -> Params:
-        """Scores uniform in [0, 1), so that every category is equally likely, and lengths uniform in their range."""
-        struct = param_struct(self.param_spec)
-        w = {}
-        for (name, modality), key_block in zip(self.param_spec.items(), jax.random.split(key, len(struct)), strict=True):
-            low, high = (modality.low, modality.high) if isinstance(modality, Vector) else (0.0, 1.0)
-            w[name] = jax.random.uniform(key_block, struct[name].shape, minval=low, maxval=high)
-        return w
+        """Tables, cans and goals alike; consumes `key`."""
+        return sample_uniform(self.param_spec, key)
 
     def instantiate(self, w: Params) -> Task:
         """The task of parameter `w`; see `placement` for the rules."""

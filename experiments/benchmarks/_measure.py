@@ -271,7 +271,7 @@ def conditions() -> dict[str, Any]:
     return {
         "git_commit": runtime.git_commit(),
         "cpu": _cpu_model(),
-        "cores": os.cpu_count(),
+        "cores": runtime.cores(),
         "packages": runtime.versions(),
         "peers": runtime.versions(PEERS),
     }

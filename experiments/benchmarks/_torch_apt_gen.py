@@ -1,7 +1,7 @@
 """APT-Gen on Grid-World the way such work is usually published: an eager PyTorch loop around an environment in Python.
 
 What `apt_jax` is timed against, and checked by: the networks, losses and rules of its `apt_gen`, for any config with
-`n_step` 1.  Evaluation, and the restore rule that goes by it, are left out.
+`n_step` 1 and `beta_rule` "doubling".  Evaluation, and what goes by it (the restore rule, fresh Q-networks), are left out.
 """
 
 from __future__ import annotations

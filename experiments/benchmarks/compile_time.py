@@ -6,6 +6,7 @@ What happens before anything is compiled, importing and answering `--help`, is t
 
 from __future__ import annotations
 
+import dataclasses
 import statistics
 import subprocess
 import sys
@@ -78,8 +79,10 @@ def main() -> int:
     """The command line."""
     args = tyro.cli(Args, prog="python -m experiments.benchmarks.compile_time")
     _measure.check(args)
+    if args.quick:
+        args = dataclasses.replace(args, repeats=1)
     starts: dict[str, list[Start]] = {"cold": [], "warm": []}
-    for _ in range(1 if args.quick else args.repeats):
+    for _ in range(args.repeats):
         with tempfile.TemporaryDirectory() as cache:
             for kind in starts:
                 starts[kind].append(_measure.in_new_process(start, Path(cache), args, requested=time.time()))
@@ -122,7 +125,7 @@ def start(cache: Path, args: Args, *, requested: float) -> Start:
     _measure.pin(args.cores)
     runtime.setup()
     jax.config.update("jax_compilation_cache_dir", str(cache))
-    space, target, config, one = _measure.load_problem(args.preset, space=args.space)
+    space, target, config, one = _measure.load_problem(args.preset, space=args.space, **(_measure.QUICK if args.quick else {}))
     program = make_program(make_trainer(space, config), args.seeds)
     targets, hparams = stack_targets([target] * args.seeds), stack_hparams([one] * args.seeds)
     programs = Programs.of(args)

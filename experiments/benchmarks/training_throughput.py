@@ -29,6 +29,7 @@ import tyro
 
 from apt_jax.lanes import make_program, stack_hparams, stack_targets
 from apt_jax.trainer import Clock, make_trainer
+from experiments import runtime
 from experiments.benchmarks import _measure
 from experiments.benchmarks._in_turns import Begun, Worker
 from experiments.benchmarks._measure import Options, Problem, Timing
@@ -53,7 +54,7 @@ class Args(Options):
     peers: tuple[Literal["eager", "compile"], ...] = ("eager", "compile")
     preset: Literal["paper", "fast"] = "fast"
     seeds: int = 8
-    cores: int = os.cpu_count() or 1
+    cores: int = runtime.cores()
     steps: int = 1_000
 
 
