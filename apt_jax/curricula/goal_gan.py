@@ -84,7 +84,7 @@ def make(space: TaskSpace, config: Config) -> Curriculum:
     """A least-squares GAN over the flattened task parameter.
 
     It learns as often as the other models, `Config.model_updates_per_step`, which is more often than in the reference (250
-    rounds of batches of 64 per 100 new tasks).
+    rounds of batches of 64 per 100 new tasks).  Its first good tasks are those of the uniformly random policy of the warm-up.
 
     Raises:
       ValueError: the replay does not hold the episodes of the tasks that it learns from.
