@@ -108,8 +108,9 @@ def test_mistakes_about_the_progression_are_told(own_table_run, tmp_path, monkey
     def draw(**options):
         progression.draw(progression.Args(**{"run_dir": own_table_run, "out": tmp_path / "it.png", **options}))
 
-    with pytest.raises(UsageError, match="nowhere is no directory"):
-        draw(out=tmp_path / "nowhere" / "it.png")
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="file is no directory"):
+        draw(out=tmp_path / "file" / "it.png")
     with pytest.raises(UsageError, match=r"config\.json"):
         draw(run_dir=tmp_path)
     monkeypatch.setenv("MUJOCO_GL", "glfw")
