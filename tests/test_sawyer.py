@@ -356,8 +356,9 @@ class TestFilm:
         assert cans[1][1] - cans[0][1] > 10
 
     def test_mistakes_are_told(self, tmp_path):
+        (tmp_path / "file").touch()
         with pytest.raises(UsageError, match="is no directory"):
-            film.film(film.Args(tmp_path / "nowhere" / "film.gif"))
+            film.film(film.Args(tmp_path / "file" / "film.gif"))
         with pytest.raises(UsageError, match="closest is 'A'"):
             film.film(film.Args(tmp_path / "film.gif", target="a"))
         with pytest.raises(UsageError, match="plays manipulation, not grid_world"):
