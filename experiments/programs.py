@@ -14,11 +14,14 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
@@ -135,11 +138,22 @@ def _save(file: Path, compiled: jax.stages.Compiled) -> None:
         warnings.warn(f"a compiled program could not be kept: {error}", stacklevel=2)
 
 
+@cache
+def _look_up_lapack() -> None:
+    """JAX looks LAPACK's functions up when it lowers a call of one; a program that comes without lowering would call nothing.
+
+    On CPU that ends the process.
+    """
+    square = jax.ShapeDtypeStruct((1, 1), np.float32)
+    jax.jit(jnp.linalg.cholesky).trace(square).lower(lowering_platforms=("cpu",))
+
+
 def _load(file: Path) -> jax.stages.Compiled | None:
     """None if there is none, or none that can be used."""
     try:
         (serialized, in_tree, out_tree), ids = pickle.loads(zlib.decompress(file.read_bytes()))
         devices = [device for device in jax.devices() if device.id in ids]
+        _look_up_lapack()
         return serialize_executable.deserialize_and_load(serialized, in_tree, out_tree, execution_devices=devices)
     except OSError:
         return None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -19,6 +21,8 @@ from experiments.programs import Programs
 from experiments.settings import Experiment, Session
 from experiments.train import kept_programs
 from tests.corridor import Corridor
+
+ROOT = Path(__file__).parents[1]
 
 
 class Doubling:
@@ -95,6 +99,28 @@ def test_where_nothing_can_be_written_a_run_goes_on(tmp_path):
     with pytest.warns(UserWarning, match="could not be kept"):
         compiled = Programs(tmp_path / "file").compile("double", Doubling().jitted, state())
     np.testing.assert_array_equal(compiled(state())["x"], [2, 2, 2])
+
+
+FACTORISE = """
+import sys
+from pathlib import Path
+import jax
+import jax.numpy as jnp
+from experiments.programs import Programs
+
+own = Programs(Path(sys.argv[1]))
+square = 4.0 * jnp.eye(2)
+factor = own.compile("factorise", jax.jit(jnp.linalg.cholesky), square)(square)
+print(own.loaded, factor.tolist())
+"""
+
+
+def test_a_loaded_program_may_call_lapack(tmp_path):
+    """In processes of their own: one that has lowered such a call before would hide what is missing."""
+    for loaded in (0, 1):
+        command = [sys.executable, "-c", FACTORISE, str(tmp_path)]
+        process = subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True)
+        assert process.stdout == f"{loaded} [[2.0, 0.0], [0.0, 2.0]]\n"
 
 
 @pytest.fixture
