@@ -102,8 +102,13 @@ def machine() -> tuple[object, ...]:
 
 
 def _type(leaf: Any) -> tuple[object, ...]:
+    """Shape, dtype, and which part is where: shardings that differ in words alone, as all do on one device, are the same."""
     sharding = getattr(leaf, "sharding", None)
-    return jax.typeof(leaf), sharding, sharding and _ids(sharding)
+    if sharding is None:
+        return (jax.typeof(leaf),)
+    where: dict[jax.Device, Any] = sharding.devices_indices_map(leaf.shape)
+    parts = sorted((device.id, str(part)) for device, part in where.items())
+    return jax.typeof(leaf), sharding.memory_kind, parts
 
 
 def _ids(sharding: jax.sharding.Sharding) -> list[int]:

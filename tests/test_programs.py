@@ -62,6 +62,16 @@ def test_a_second_start_traces_nothing_and_computes_the_same(tmp_path):
         np.testing.assert_array_equal(one, other)
 
 
+def test_on_one_device_it_does_not_matter_how_an_array_is_said_to_be_split(tmp_path):
+    Programs(tmp_path).compile("double", Doubling().jitted, state())
+    again = state()
+    mesh = Mesh(np.array(jax.devices()[:1]), ("lane",))
+    again["x"] = jax.device_put(again["x"], NamedSharding(mesh, PartitionSpec("lane")))
+    own = Programs(tmp_path)
+    np.testing.assert_array_equal(own.compile("double", Doubling().jitted, again)(again)["x"], [2, 2, 2])
+    assert own.loaded == 1
+
+
 @pytest.mark.parametrize(
     ("name", "made_of", "argument"),
     [
