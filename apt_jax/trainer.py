@@ -293,9 +293,9 @@ def _in_float32(function: F) -> F:
     """Whole float32 products also where accelerators would round a matmul's inputs: values of actions differ by less."""
 
     @wraps(function)
-    def precise(*args: Any) -> Any:
+    def precise(*args: Any, **options: Any) -> Any:
         with jax.default_matmul_precision("highest"):
-            return function(*args)
+            return function(*args, **options)
 
     return cast(F, precise)
 

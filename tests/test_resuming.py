@@ -17,11 +17,12 @@ import pytest
 from jax.sharding import Mesh
 
 import envs
-from experiments import compare, pictures, settings
+from apt_jax import checkpoint
+from experiments import compare, pictures, settings, train
 from experiments.compare import Compare
 from experiments.problem import make_problem
 from experiments.run_dir import RunDir
-from experiments.runner import lane_inputs, load_states
+from experiments.runner import Runner, lane_inputs, load_states
 from tests import corridor_runs
 from tests.corridor_runs import OPTIONS
 
@@ -56,7 +57,8 @@ def whole(tmp_path_factory, start):
 
 @pytest.fixture(autouse=True)
 def _registered(monkeypatch):
-    monkeypatch.setattr(corridor_runs.pictures, "draw", None)
+    monkeypatch.setattr(corridor_runs.pictures, "draw", None)  # both are as they were afterwards
+    monkeypatch.setitem(envs.SPACES, "corridor", None)
     corridor_runs.register()
 
 
@@ -119,6 +121,23 @@ def test_an_interrupt_during_the_last_pictures_stops_what_would_come_next(tmp_pa
     assert compare.make_in_turn(runs) == 130
     assert (tmp_path / "far" / "dqn" / "summary.json").exists()
     assert not (tmp_path / "far" / "random").exists()
+
+
+def test_an_interrupt_during_the_warm_up_saves_it(tmp_path, monkeypatch):
+    warmup = Runner.warmup
+
+    def interrupted(runner):
+        warmup(runner)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Runner, "warmup", interrupted)
+    run = tmp_path / "run"
+    options = ["--target", "far", "--method", "dqn", *OPTIONS, "--seeds", "0", "--env-steps", "60"]
+    assert train.train(*settings.parse(["--run-dir", str(run), *options])) == 130
+    assert checkpoint.latest_step(run / "checkpoints") == 40
+    monkeypatch.setattr(Runner, "warmup", None)  # it is not made again
+    assert train.train(*settings.parse(["--run-dir", str(run), "--resume"])) == 0
+    assert [row["env_steps"] for row in rows(run)] == ["60"]
 
 
 def test_a_seed_is_the_same_on_eight_devices(tmp_path, start, whole):

@@ -194,6 +194,14 @@ def test_64_bits_are_refused():
         make_trainer(SPACE, CONFIG)
 
 
+def test_matmuls_are_whole_float32_whatever_the_platforms_default():
+    trainer = make_trainer(SPACE, config("dqn"))
+    state = jax.eval_shape(trainer.init, jax.random.key(0), TARGET, HParams())
+    obs = jax.eval_shape(lambda: SPACE.reset(jax.random.key(0), TARGET)[1])
+    text = jax.jit(trainer.act).lower(state.policy, obs=obs).as_text()
+    assert text.count("dot_general") == text.count("precision = [HIGHEST, HIGHEST]") > 0
+
+
 def test_a_space_may_compute_with_weak_dtypes():
     class Weak(Corridor):
         obs_spec: ClassVar = {"position": Vector(1, 0, 1)}
@@ -399,14 +407,21 @@ def test_evaluating_more_often_changes_nothing_in_training():
         np.testing.assert_array_equal(a, b)
 
 
+def lanes_equal(one, other):
+    """Of two lanes, whether all leaves are the same."""
+    pairs = list(zip(leaves(one), leaves(other), strict=True))
+    return [all(np.array_equal(a[lane], b[lane]) for a, b in pairs) for lane in (0, 1)]
+
+
 def test_an_unsolved_run_resets_its_q_function_and_nothing_else():
     slow = HParams(learning_rate=1e-5)
     states, _, history = run(config("random"), [2, 2], hparams=[slow, slow.replace(reset_every=2.0 * CONFIG.eval_every)])
     assert (states.kept.score < 0).all(), "the target must be unsolved"
     assert [metrics["reset"].tolist() for metrics in history] == [[0, 0], [0, 1]]
     assert has_learned(states.learner.opt_state).tolist() == [True, False]
-    for leaf in leaves((states.replay, states.workers, states.kept, states.policy)):
+    for leaf in leaves((states.replay, states.workers, states.kept)):
         np.testing.assert_array_equal(leaf[0], leaf[1])
+    assert lanes_equal(states.policy, states.learner.target_params) == [True, False]
 
 
 def test_target_source_plays_only_the_target_and_the_generated_source_its_w():

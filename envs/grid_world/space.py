@@ -38,7 +38,7 @@ class Space:
     fps: float = 5.0
 
     def sample_uniform(self, key: Key[Array, ""]) -> Params:
-        """Every category of a tile and every place of an object equally likely; consumes `key`."""
+        """Scores in [0, 1), coordinates in [0, 10) tiles, both uniform (`task_space.sample_uniform`); consumes `key`."""
         return sample_uniform(self.param_spec, key)
 
     def instantiate(self, w: Params) -> Task:

@@ -49,7 +49,7 @@ class Space:
         self._arm = arms.arm(arm)
 
     def sample_uniform(self, key: Key[Array, ""]) -> Params:
-        """Tables, cans and goals alike; consumes `key`."""
+        """Scores in [0, 1), lengths in their range in metres, both uniform (`task_space.sample_uniform`); consumes `key`."""
         return sample_uniform(self.param_spec, key)
 
     def instantiate(self, w: Params) -> Task:

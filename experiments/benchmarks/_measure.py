@@ -25,7 +25,7 @@ import numpy as np
 
 import envs
 from apt_jax.config import PRESETS, Config, HParams
-from experiments import runtime
+from experiments import markdown, runtime
 from experiments.errors import UsageError
 
 C = TypeVar("C")
@@ -216,8 +216,7 @@ def number(value: float) -> str:
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table; every column but the first is aligned to the right."""
-    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    return markdown.table(header, rows, numbers=True) + "\n"
 
 
 def result_path(name: str, options: Options) -> Path:
