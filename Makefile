@@ -2,10 +2,10 @@
 
 PYTHON ?= python3
 VENV ?= .venv
-# Test processes side by side; each holds its own JAX and compiles for itself.  One that dies ends the run: pytest-xdist may wait
-# for ever for the rest of a dead process's file.
+# Test processes side by side; each holds its own JAX and compiles for itself, and takes the next file in conftest.py's order.  One
+# that dies ends the run: pytest-xdist may wait for ever for the rest of a dead process's file.
 JOBS ?= 2
-PYTEST_ARGS ?= -n $(JOBS) --dist loadfile --max-worker-restart=0 --durations=10
+PYTEST_ARGS ?= -n $(JOBS) --dist loadfile --no-loadscope-reorder --max-worker-restart=0 --durations=10
 ARGS ?= --space grid_world --target A --method apt_gen --preset fast --seeds 0 --run-dir runs/quickstart \
 	$(if $(wildcard runs/quickstart/config.json),--resume)
 BENCH_ARGS ?=

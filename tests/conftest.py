@@ -58,6 +58,32 @@ def _standard_promotion(function: Callable[..., Any]) -> Callable[..., Any]:
 optax.tree.bias_correction = _standard_promotion(optax.tree.bias_correction)
 
 
+LONGEST = (
+    "trainer",
+    "resuming",
+    "sawyer",
+    "bonuses",
+    "manipulation_training",
+    "sawyer_mjx",
+    "apt_gen",
+    "benchmarks",
+    "manipulation_tasks",
+    "manipulation_physics",
+    "train_cli",
+    "runner",
+    "networks",
+    "curricula",
+    "compiled_program",
+)
+"""Files that take half a minute or more."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first, so that processes side by side end together."""
+    places = {f"test_{name}": place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
+
+
 MAPS, MANY, TOO_MANY = Path("/proc/self/maps"), 20_000, 45_000
 """Where Linux lists a process's memory maps; it allows 65,530 (`vm.max_map_count`)."""
 

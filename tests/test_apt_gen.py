@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import flax.linen as nn
 import jax
@@ -15,6 +16,7 @@ from apt_jax import replay as rp
 from apt_jax.config import HParams
 from apt_jax.curricula import apt_gen
 from apt_jax.curricula import apt_gen_objectives as objectives
+from apt_jax.descent import ADAM
 from apt_jax.networks.generator import OUTPUT_NORM
 from apt_jax.specs import Grid, Table
 from tests.corridor import Corridor
@@ -35,11 +37,30 @@ class Bowl(nn.Module):
         return -((w["goal"][..., 0] - centre) ** 2) / 10.0
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def experience():
     """A replay with finished episodes of both sources."""
     states, clock, _ = run(dataclasses.replace(CONFIG, method="random"), [0])
     return jax.tree.map(lambda x: x[0], states.replay), clock.iteration - 1
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    """The state that training starts with."""
+    return jax.jit(apt_gen.make(SPACE, CONFIG).init)(jax.random.key(0), HParams())
+
+
+def with_values(state, **parameters):
+    """The state of value networks, in ensembles of one, whose one parameter is V1's and V2's of what is given."""
+    ((name, (v1, v2)),) = parameters.items()
+    progress_value, return_value = ({"params": {name: jnp.full(1, value)}} for value in (v1, v2))
+    models = state.models._replace(progress_value=progress_value, return_value=return_value)
+    return state._replace(models=models, opt_state=ADAM.init(models))
+
+
+def proposer(curriculum, number):
+    """`propose(state, hparams)`: goals of some tasks."""
+    return jax.jit(lambda state, hparams: curriculum.propose(state, jax.random.key(2), number, hparams)["goal"])
 
 
 def trainer(curriculum, experience, rounds):
@@ -65,20 +86,17 @@ def trainer(curriculum, experience, rounds):
         ({"return_weight": 0.0}, {1.0: 2.0}),
     ],
 )
-def test_generator_reaches_the_optimum_of_v1_plus_beta_v2(monkeypatch, experience, weights, optima):
+def test_generator_reaches_the_optimum_of_v1_plus_beta_v2(monkeypatch, fresh, experience, weights, optima):
     """V1 peaks at 2 and V2 at 8, so the sum peaks at (2 + 8 beta) / (1 + beta); an ablation leaves one of them."""
     monkeypatch.setattr(objectives, "ValueNetwork", Bowl)
     hparams = HParams(value_learning_rate=0.0, generator_learning_rate=2e-2, vector_noise=0.0)
     curriculum = apt_gen.make(SPACE, CONFIG, **weights)
-    state = curriculum.init(jax.random.key(0), hparams)
-    v1, v2 = ({"params": {"centre": jnp.full(1, c)}} for c in (2.0, 8.0))  # ensembles of one
-    state = state._replace(models=state.models._replace(progress_value=v1, return_value=v2))
+    state = with_values(fresh, centre=(2.0, 8.0))
 
-    train = trainer(curriculum, experience, rounds=200)
+    train, propose = trainer(curriculum, experience, rounds=200), proposer(curriculum, 256)
     for beta, optimum in optima.items():
         trained, _ = train(state._replace(beta=jnp.float32(beta)), hparams)
-        goal = curriculum.propose(trained, jax.random.key(2), 256, hparams)["goal"]
-        np.testing.assert_allclose(jnp.mean(goal), optimum, atol=0.3)
+        np.testing.assert_allclose(np.mean(propose(trained, hparams)), optimum, atol=0.3)
 
 
 class Indifferent(nn.Module):
@@ -91,32 +109,32 @@ class Indifferent(nn.Module):
         return 0.0 * w["goal"][..., 0] + self.param("value", nn.initializers.zeros, ())
 
 
-def test_prior_brings_a_number_back_from_the_end_of_its_range(monkeypatch, experience):
+def test_prior_brings_a_number_back_from_the_end_of_its_range(monkeypatch, fresh, experience):
     monkeypatch.setattr(objectives, "ValueNetwork", Indifferent)
     hparams = HParams(value_learning_rate=0.0, generator_learning_rate=5e-2)
     curriculum = apt_gen.make(SPACE, CONFIG)
-    state = curriculum.init(jax.random.key(0), hparams)
-    norm = state.models.generator["goal"][OUTPUT_NORM]
-    norm["bias"], norm["scale"] = jnp.full(1, 6.0), jnp.full(1, 0.05)
+    state = with_values(fresh, value=(0.0, 0.0))
+    goal = state.models.generator["goal"]
+    norm = goal[OUTPUT_NORM] | {"bias": jnp.full(1, 6.0), "scale": jnp.full(1, 0.05)}
+    generator = state.models.generator | {"goal": goal | {OUTPUT_NORM: norm}}
+    state = state._replace(models=state.models._replace(generator=generator))
 
-    train = trainer(curriculum, experience, rounds=400)
+    train, propose = trainer(curriculum, experience, rounds=400), proposer(curriculum, 512)
     for prior, mean, deviation in ((0.0, 8.98, 0.0), (0.03, 4.5, 1.9)):
         trained, _ = train(state, hparams.replace(vector_prior=prior))
-        goal = curriculum.propose(trained, jax.random.key(2), 512, hparams)["goal"]
-        np.testing.assert_allclose((jnp.mean(goal), jnp.std(goal)), (mean, deviation), atol=0.2)
+        goals = np.asarray(propose(trained, hparams))
+        np.testing.assert_allclose((goals.mean(), goals.std()), (mean, deviation), atol=0.2)
 
 
 @pytest.mark.parametrize("judge_parts", [False, True])
-def test_discriminator_and_values_learn_from_the_same_experience(experience, judge_parts):
+def test_discriminator_and_values_learn_from_the_same_experience(fresh, experience, judge_parts):
     hparams = HParams(discriminator_learning_rate=3e-3, value_learning_rate=3e-3, generator_learning_rate=0.0)
     curriculum = apt_gen.make(SPACE, dataclasses.replace(CONFIG, judge_parts=judge_parts))
-    state = curriculum.init(jax.random.key(0), hparams)
-
-    trained, metrics = trainer(curriculum, experience, rounds=400)(state, hparams)
+    trained, metrics = trainer(curriculum, experience, rounds=400)(fresh, hparams)
     late = jax.tree.map(lambda x: np.mean(x[-50:]), metrics)
     assert late["discriminator_target_logit"] > 0.5 > -0.5 > late["discriminator_generated_logit"]
     assert late["v2_unexplained"] < 0.3
-    for before, after in zip(jax.tree.leaves(state.models.generator), jax.tree.leaves(trained.models.generator), strict=True):
+    for before, after in zip(jax.tree.leaves(fresh.models.generator), jax.tree.leaves(trained.models.generator), strict=True):
         np.testing.assert_array_equal(before, after, err_msg="a rate of zero must leave the generator alone")
 
 
@@ -159,11 +177,10 @@ def test_correlation():
     assert apt_gen.correlation(a, jnp.ones(3)) == 0.0
 
 
-def test_proposals_do_not_depend_on_how_many_are_drawn_at_once():
+def test_proposals_do_not_depend_on_how_many_are_drawn_at_once(fresh):
     """Running statistics, not those of the batch: one task alone is as diverse as many."""
     curriculum = apt_gen.make(SPACE, CONFIG)
-    state = curriculum.init(jax.random.key(0), HParams())
-    propose = jax.jit(lambda key: curriculum.propose(state, key, 1, HParams())["goal"][0, 0])
+    propose = jax.jit(lambda key: curriculum.propose(fresh, key, 1, HParams())["goal"][0, 0])
     singles = [propose(key) for key in jax.random.split(jax.random.key(3), 64)]
     assert np.std(singles) > 0.5
 
@@ -194,13 +211,11 @@ def test_exploration_and_hardening_treat_a_table_like_a_grid():
 
 def generated_episodes(returns, ends):
     """A replay whose generated source finished these episodes."""
-    rings = rp.init(SPACE.obs_spec, SPACE.param_spec, sources=2, envs=CONFIG.envs_per_source, columns=100, episodes=64)
+    empty = partial(rp.init, SPACE.obs_spec, SPACE.param_spec, sources=2, envs=CONFIG.envs_per_source, columns=100, episodes=64)
+    rings = jax.tree.map(np.array, jax.jit(empty)())
     n = len(returns)
-    episodes = rings.episodes._replace(
-        episode_return=rings.episodes.episode_return.at[1, :n].set(jnp.array(returns)),
-        end=rings.episodes.end.at[1, :n].set(jnp.array(ends, jnp.int32)),
-    )
-    return rings._replace(episodes=episodes, finished=jnp.array([0, n], jnp.int32))
+    rings.episodes.episode_return[1, :n], rings.episodes.end[1, :n] = returns, ends
+    return rings._replace(finished=np.array([0, n], np.int32))
 
 
 @pytest.mark.parametrize(
@@ -216,8 +231,12 @@ def generated_episodes(returns, ends):
 def test_beta_follows_only_what_ended_after_the_warm_up(rule, returns, ends, beta):
     curriculum = apt_gen.make(SPACE, dataclasses.replace(CONFIG, beta_rule=rule))
     state = jax.eval_shape(curriculum.init, jax.random.key(0), HParams())._replace(beta=jnp.float32(1.0))
-    refreshed = curriculum.refresh(state, jax.random.key(1), generated_episodes(returns, ends), jnp.int32(30), HParams())
-    np.testing.assert_allclose(refreshed.beta, beta, rtol=1e-6)
+
+    @jax.jit
+    def refreshed_beta(replay):
+        return curriculum.refresh(state, jax.random.key(1), replay, jnp.int32(30), HParams()).beta
+
+    np.testing.assert_allclose(refreshed_beta(generated_episodes(returns, ends)), beta, rtol=1e-6)
 
 
 def test_an_unknown_rule_for_beta_is_refused():
@@ -244,19 +263,17 @@ def test_rollouts_hold_the_steps_of_their_episode_only():
     np.testing.assert_allclose(rollouts.episode_return, outcome.episode_return)
 
 
-def test_report_compares_each_value_network_with_its_own_truth(monkeypatch):
+def test_report_compares_each_value_network_with_its_own_truth(monkeypatch, fresh):
     """V2's ensemble knows the return but for a constant."""
     monkeypatch.setattr(objectives, "ValueNetwork", Bowl)
     curriculum = apt_gen.make(SPACE, CONFIG)
-    state = curriculum.init(jax.random.key(0), HParams())
-    v1, v2 = ({"params": {"centre": jnp.full(1, c)}} for c in (8.0, 2.0))
-    state = state._replace(models=state.models._replace(progress_value=v1, return_value=v2))
+    state = with_values(fresh, centre=(8.0, 2.0))
     goals = jnp.arange(1, 9, dtype=jnp.int32)
     w = {"goal": goals[:, None].astype(jnp.float32), "paint": jnp.zeros((8, 4, 4, 2))}
     outcome, transitions = evaluation.play(SPACE, goals, lambda obs, _: jnp.ones(8, jnp.int32), jax.random.key(0))
     rollouts = evaluation.sample_rollouts(w, outcome, transitions, jax.random.key(1), steps=4)
     rollouts = rollouts._replace(episode_return=-((goals.astype(jnp.float32) - 2.0) ** 2) / 10.0 - 0.25)
-    report = curriculum.report(state, rollouts, HParams())
+    report = jax.jit(curriculum.report)(state, rollouts, HParams())
     np.testing.assert_allclose(report["v2_correlation"], 1.0, atol=1e-3)
     np.testing.assert_allclose(report["v2_bias"], 0.25, atol=1e-4)
     assert abs(report["v1_correlation"]) < 0.999

@@ -24,15 +24,17 @@ from tests.corridor import Corridor
 SPEC = {"tiles": Grid(2, 2, 3), "xy": Vector(2, 0, 10), "place": Table(2, 4)}
 
 
+learning_progress = jax.jit(alp_gmm.learning_progress, static_argnames="window")
+
+
 def progress(w, returns, window=None):
     """`learning_progress` of episodes given oldest first, as is its result."""
     window = window or len(returns)
     history = len(returns)
-    newest_first = jnp.asarray(np.asarray(w, np.float32)[::-1]), jnp.asarray(np.asarray(returns, np.float32)[::-1])
-    pad = [(0, history)]
-    w, r = jnp.pad(newest_first[0], [*pad, (0, 0)]), jnp.pad(newest_first[1], pad)
-    earlier = len(returns) - 1 - jnp.arange(w.shape[0], dtype=jnp.int32)
-    return np.asarray(alp_gmm.learning_progress(w, r, earlier, window=window))[::-1]
+    w, r = (np.asarray(x, np.float32)[::-1] for x in (w, returns))
+    w, r = np.pad(w, [(0, history), (0, 0)]), np.pad(r, (0, history))
+    earlier = history - 1 - np.arange(len(w), dtype=np.int32)
+    return np.asarray(learning_progress(w, r, earlier, window=window))[::-1]
 
 
 def brute_force(w, returns, history=None):
@@ -61,8 +63,8 @@ def test_learning_progress_equals_its_definition(episodes):
     w = [episode[:2] for episode in episodes]
     returns = [episode[2] / 4 for episode in episodes]
     np.testing.assert_allclose(progress(w, returns), brute_force(w, returns), atol=1e-6)
-    newest, earlier = (jnp.asarray(np.asarray(x, np.float32)[::-1]) for x in (w, returns))
-    short = alp_gmm.learning_progress(newest, earlier, 11 - jnp.arange(12, dtype=jnp.int32), window=8)
+    newest, earlier = (np.asarray(x, np.float32)[::-1] for x in (w, returns))
+    short = np.asarray(learning_progress(newest, earlier, 11 - np.arange(12, dtype=np.int32), window=8))
     np.testing.assert_allclose(short[::-1], brute_force(w, returns, history=4)[4:], atol=1e-6)
 
 

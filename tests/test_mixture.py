@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
-from apt_jax.curricula.mixture import draw, fit, invert_lower, k_means
+from apt_jax.curricula import mixture
+
+fit = jax.jit(mixture.fit, static_argnames=("slots", "diagonal"))
+k_means = jax.jit(mixture.k_means, static_argnames="slots")
+draw = jax.jit(jax.vmap(mixture.draw, in_axes=(None, None, 0)))
 
 ROWS = np.array(
     [
@@ -50,7 +54,7 @@ def reference(rows, labels, k, regularisation):
 
 
 def test_worked_case():
-    result = fit(ROWS, jnp.ones(10, bool), LABELS, jnp.int32(2), slots=10, regularisation=1e-3)
+    result = fit(ROWS, np.ones(10, bool), LABELS, np.int32(2), slots=10, regularisation=1e-3)
     assert result.iterations == 3
     np.testing.assert_allclose(result.mixture.weights[:2], [0.505246, 0.494754], atol=1e-5)
     np.testing.assert_allclose(
@@ -62,9 +66,9 @@ def test_worked_case():
 @pytest.mark.parametrize(("k", "parameters"), [(2, 19), (10, 99)])
 def test_number_of_parameters(k, parameters):
     """Of one row that every component fits alike, the criterion is the parameters less twice the log-likelihood."""
-    row = jnp.zeros((1, 3))
-    labels = jnp.zeros(1, jnp.int32)
-    result = fit(row, jnp.ones(1, bool), labels, jnp.int32(k), slots=10, regularisation=1.0)
+    row = np.zeros((1, 3), np.float32)
+    labels = np.zeros(1, np.int32)
+    result = fit(row, np.ones(1, bool), labels, np.int32(k), slots=10, regularisation=1.0)
     likelihood = -1.5 * np.log(2 * np.pi)
     np.testing.assert_allclose(result.aic, 2 * parameters - 2 * likelihood, rtol=1e-4)
 
@@ -78,8 +82,8 @@ def test_agrees_with_scikit_learn_for_every_number_of_components_at_once():
     ks = np.arange(2, 11, dtype=np.int32)
     labels = np.stack([np.arange(len(rows), dtype=np.int32) * 7919 % k for k in ks])
     padding = 9
-    padded = jnp.asarray(np.concatenate([rows, np.full((padding, 3), 50.0, np.float32)]))
-    valid = jnp.arange(len(padded), dtype=jnp.int32) < len(rows)
+    padded = np.concatenate([rows, np.full((padding, 3), 50.0, np.float32)])
+    valid = np.arange(len(padded)) < len(rows)
 
     def one(k, labels):
         return fit(padded, valid, labels, k, slots=10, regularisation=1e-3)
@@ -95,16 +99,16 @@ def test_agrees_with_scikit_learn_for_every_number_of_components_at_once():
 
 
 def test_a_diagonal_covariance_has_no_other_entries():
-    result = fit(ROWS, jnp.ones(10, bool), LABELS, jnp.int32(2), slots=3, regularisation=1e-3, diagonal=True)
+    result = fit(ROWS, np.ones(10, bool), LABELS, np.int32(2), slots=3, regularisation=1e-3, diagonal=True)
     factors = np.asarray(result.mixture.scale_tril)
     np.testing.assert_array_equal(factors, factors * np.eye(3))
-    full = fit(ROWS, jnp.ones(10, bool), LABELS, jnp.int32(2), slots=3, regularisation=1e-3)
+    full = fit(ROWS, np.ones(10, bool), LABELS, np.int32(2), slots=3, regularisation=1e-3)
     assert np.any(np.asarray(full.mixture.scale_tril) * (1 - np.eye(3)) != 0)
 
 
 def test_a_covariance_without_a_factor_gives_no_criterion():
-    rows = jnp.zeros((4, 2))
-    result = fit(rows, jnp.ones(4, bool), jnp.zeros(4, jnp.int32), jnp.int32(2), slots=3, regularisation=-1.0)
+    rows = np.zeros((4, 2), np.float32)
+    result = fit(rows, np.ones(4, bool), np.zeros(4, np.int32), np.int32(2), slots=3, regularisation=-1.0)
     assert np.isnan(result.aic)
     assert result.iterations < 3, "and ends at once"
 
@@ -113,31 +117,33 @@ def test_a_covariance_without_a_factor_gives_no_criterion():
 def test_inverse_of_a_triangle(size):
     lower = np.tril(np.random.default_rng(size).normal(size=(size, size))).astype(np.float32)
     lower[np.diag_indices(size)] = 2.0 + np.abs(lower[np.diag_indices(size)])
-    np.testing.assert_allclose(invert_lower(jnp.asarray(lower)) @ lower, np.eye(size), atol=1e-3)
+    np.testing.assert_allclose(jax.jit(mixture.invert_lower)(lower) @ lower, np.eye(size), atol=1e-3)
 
 
 def test_draws_have_the_components_mean_and_covariance():
-    mixture = fit(ROWS, jnp.ones(10, bool), LABELS, jnp.int32(2), slots=4, regularisation=1e-3).mixture
-    logits = jnp.array([-jnp.inf, 0.0, -jnp.inf, -jnp.inf])
-    rows = jax.vmap(lambda key: draw(mixture, logits, key))(jax.random.split(jax.random.key(0), 20_000))
-    np.testing.assert_allclose(rows.mean(0), mixture.means[1], atol=0.03)
-    np.testing.assert_allclose(np.cov(rows.T), mixture.scale_tril[1] @ mixture.scale_tril[1].T, atol=0.03)
+    fitted = fit(ROWS, np.ones(10, bool), LABELS, np.int32(2), slots=4, regularisation=1e-3).mixture
+    logits = np.array([-np.inf, 0.0, -np.inf, -np.inf], np.float32)
+    rows = np.asarray(draw(fitted, logits, jax.random.split(jax.random.key(0), 20_000)))
+    factor = np.asarray(fitted.scale_tril[1])
+    np.testing.assert_allclose(rows.mean(0), fitted.means[1], atol=0.03)
+    np.testing.assert_allclose(np.cov(rows.T), factor @ factor.T, atol=0.03)
 
 
 def test_k_means_tells_separate_clusters_apart():
     rng = np.random.default_rng(1)
     centres = np.array([[0, 0], [5, 0], [0, 5]])
-    rows = jnp.asarray(np.repeat(centres, 20, axis=0) + rng.normal(0, 0.2, (60, 2)), jnp.float32)
-    labels = np.asarray(k_means(rows, jnp.ones(60, bool), jnp.int32(3), jax.random.key(2), slots=6)).reshape(3, 20)
+    rows = (np.repeat(centres, 20, axis=0) + rng.normal(0, 0.2, (60, 2))).astype(np.float32)
+    labels = np.asarray(k_means(rows, np.ones(60, bool), np.int32(3), jax.random.key(2), slots=6)).reshape(3, 20)
     assert (labels == labels[:, :1]).all()
     assert sorted(labels[:, 0]) == [0, 1, 2]
 
 
 def test_k_means_begins_far_apart():
     """Rows far from a crowd and from each other become centres, however many the crowd is."""
-    rows = jnp.asarray(np.random.default_rng(2).normal(0, 0.5, (400, 2)), jnp.float32)
-    rows = rows.at[7].set(jnp.array([40.0, 40.0])).at[8].set(jnp.array([40.0, -40.0]))
+    rows = np.random.default_rng(2).normal(0, 0.5, (400, 2)).astype(np.float32)
+    rows[7], rows[8] = (40.0, 40.0), (40.0, -40.0)
     keys = jax.random.split(jax.random.key(0), 20)
-    labels = np.asarray(jax.vmap(lambda key: k_means(rows, jnp.ones(400, bool), jnp.int32(3), key, slots=4))(keys))
+    each = jax.vmap(partial(k_means, slots=4), in_axes=(None, None, None, 0))
+    labels = np.asarray(each(rows, np.ones(400, bool), np.int32(3), keys))
     for far in (7, 8):
         assert ((labels == labels[:, far, None]).sum(axis=1) == 1).all()

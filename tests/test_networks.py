@@ -279,13 +279,13 @@ def test_vector_divergence_is_that_of_normal_distributions():
     params = {"goal": {OUTPUT_NORM: {"bias": jnp.array(biases), "scale": jnp.array(scales)}}}
     spec = {"table": Grid(6, 4, 3), "goal": Vector(2, 0.0, 9.0)}
     np.testing.assert_allclose(vector_divergence(spec, params), expected, rtol=1e-5)
-    fresh = Generator(spec).init(jax.random.key(0), jnp.zeros((2, NOISE_SIZE)), train=True)["params"]
+    fresh = jax.jit(lambda key: Generator(spec).init(key, jnp.zeros((2, NOISE_SIZE)), train=True)["params"])(jax.random.key(0))
     np.testing.assert_allclose(vector_divergence(spec, fresh), 0.0, atol=1e-6)
 
 
 def test_spectral_normalize_covers_every_kernel_of_the_discriminator():
     params = initial_params("discriminator")["params"]
-    u = init_singular_vectors(jax.random.key(1), params)
+    u = jax.jit(init_singular_vectors)(jax.random.key(1), params)
     step = jax.jit(lambda u: spectral_normalize(params, u, bound=0.8))
     for _ in range(100):
         normalized, u = step(u)
@@ -297,8 +297,8 @@ def test_spectral_normalize_covers_every_kernel_of_the_discriminator():
 
 def test_spectral_normalize_leaves_kernels_within_the_bound_alone():
     params = initial_params("discriminator")["params"]
-    u = init_singular_vectors(jax.random.key(1), params)
-    unbounded, _ = spectral_normalize(params, u, bound=np.inf)
+    u = jax.jit(init_singular_vectors)(jax.random.key(1), params)
+    unbounded, _ = jax.jit(lambda u: spectral_normalize(params, u, bound=np.inf))(u)
     for before, after in zip(jax.tree.leaves(params), jax.tree.leaves(unbounded), strict=True):
         np.testing.assert_array_equal(before, after)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,13 @@ import pytest
 
 from apt_jax import replay
 from apt_jax.specs import Vector
+
+sample_transitions = jax.jit(
+    replay.sample_transitions, static_argnames=("batches", "batch_size", "n_step", "success_share", "horizon")
+)
+sample_rollouts = jax.jit(replay.sample_rollouts, static_argnames=("source", "batch_size", "steps", "recent"))
+recent_outcome = jax.jit(replay.recent_outcome, static_argnames=("source", "window"))
+write = jax.jit(replay.write)
 
 SOURCES, ENVS, COLUMNS, SLOTS = 2, 3, 16, 8
 OBS = {"x": Vector(1, 0, 1000)}
@@ -22,6 +30,7 @@ def _code(source, env, iteration):
     return iteration + 100 * env + 10_000 * source
 
 
+@functools.cache
 def _written(iterations, seed=0):
     """A replay written for some iterations with random episode ends, and the list of its finished episodes per source."""
     rng = np.random.default_rng(seed)
@@ -29,29 +38,28 @@ def _written(iterations, seed=0):
     length = np.zeros((SOURCES, ENVS), np.int32)
     finished = [[], []]
     source, env = np.meshgrid(np.arange(SOURCES), np.arange(ENVS), indexing="ij")
-    write = jax.jit(replay.write)
     for iteration in range(iterations):
         length += 1
         done = rng.random((SOURCES, ENVS)) < 0.3
         code = _code(source, env, iteration)
         transition = replay.Transition(
-            obs={"x": jnp.asarray(code[..., None], jnp.float32)},
-            action=jnp.asarray(iteration % 4 + 0 * source),
-            reward=jnp.asarray(code, jnp.float32),
-            next_obs={"x": jnp.asarray(code[..., None] + 1, jnp.float32)},
-            terminated=jnp.asarray(done & (iteration % 2 == 0)),
-            done=jnp.asarray(done),
+            obs={"x": np.asarray(code[..., None], np.float32)},
+            action=iteration % 4 + np.zeros_like(code, np.uint8),
+            reward=np.asarray(code, np.float32),
+            next_obs={"x": np.asarray(code[..., None] + 1, np.float32)},
+            terminated=done & (iteration % 2 == 0),
+            done=done,
         )
         returns = (rng.random((SOURCES, ENVS)) - 0.5).astype(np.float32)
         episode = replay.Episode(
-            w={"p": jnp.asarray(np.stack([code, code + 0.5], -1), jnp.float32)},
-            env=jnp.asarray(env, jnp.int32),
-            end=jnp.full((SOURCES, ENVS), iteration, jnp.int32),
-            length=jnp.asarray(length),
-            episode_return=jnp.asarray(returns),
-            success=jnp.asarray(returns > 0),
+            w={"p": np.stack([code, code + 0.5], -1).astype(np.float32)},
+            env=env.astype(np.int32),
+            end=np.full((SOURCES, ENVS), iteration, np.int32),
+            length=length.copy(),
+            episode_return=returns,
+            success=returns > 0,
         )
-        rings = write(rings, jnp.int32(iteration), transition, episode, jnp.asarray(done))
+        rings = write(rings, np.int32(iteration), transition, episode, done)
         for s, e in zip(*np.nonzero(done), strict=True):
             finished[s].append((e, iteration, length[s, e], returns[s, e]))
         length[done] = 0
@@ -92,7 +100,7 @@ def test_return_range_covers_finished_episodes_of_all_sources_and_is_unbounded_b
 @pytest.mark.parametrize("iterations", [3, 41])
 def test_sampled_transitions_are_whole_recent_and_equally_shared(iterations):
     rings, _ = _written(iterations)
-    batch = replay.sample_transitions(
+    batch = sample_transitions(
         rings,
         jax.random.key(1),
         jnp.int32(iterations - 1),
@@ -141,7 +149,7 @@ def test_a_source_without_success_is_drawn_uniformly():
 
 
 def _sample_successes(rings, horizon):
-    batch = replay.sample_transitions(
+    batch = sample_transitions(
         rings,
         jax.random.key(1),
         jnp.int32(40),
@@ -160,7 +168,7 @@ def test_n_step_transitions_stop_at_the_end_of_the_episode_and_of_what_is_writte
     iterations, gamma = 41, 0.5
     rings, _ = _written(iterations)
     stored = jax.tree.map(np.asarray, rings.transitions)
-    batch = replay.sample_transitions(
+    batch = sample_transitions(
         rings,
         jax.random.key(1),
         jnp.int32(iterations - 1),
@@ -195,7 +203,7 @@ def test_sampled_rollouts_are_consistent_episodes_within_the_window():
     iterations, recent = 41, 8
     rings, finished = _written(iterations)
     for source in range(SOURCES):
-        rollouts = replay.sample_rollouts(
+        rollouts = sample_rollouts(
             rings,
             jax.random.key(2),
             jnp.int32(iterations - 1),
@@ -227,7 +235,7 @@ def test_recent_episodes_are_drawn_as_often_as_is_asked(recency):
     """Of n episodes number k from the latest on is drawn if u^recency is in [k/n, (k+1)/n)."""
     rings, finished = _written(41)
     drawn = 20_000
-    rollouts = replay.sample_rollouts(
+    rollouts = sample_rollouts(
         rings, jax.random.key(3), jnp.int32(40), source=1, batch_size=drawn, steps=1, recent=30, recency=recency
     )
     latest = [(env, end) for env, end, *_ in finished[1][-SLOTS:] if end > 10][::-1]
@@ -240,19 +248,19 @@ def test_recent_episodes_are_drawn_as_often_as_is_asked(recency):
 
 def test_recent_outcome_is_the_mean_of_the_last_episodes_only():
     rings, finished = _written(41)
-    outcome = replay.recent_outcome(rings, source=1, window=4)
+    outcome = recent_outcome(rings, source=1, window=4)
     last = [episode[3] for episode in finished[1][-4:]]
     np.testing.assert_allclose(outcome["episode_return"], np.mean(last), rtol=1e-6)
     np.testing.assert_allclose(outcome["success"], np.mean(np.array(last) > 0))
     empty = replay.init(OBS, PARAM, sources=SOURCES, envs=ENVS, columns=COLUMNS, episodes=SLOTS)
-    assert np.isnan(replay.recent_outcome(empty, source=0, window=4)["episode_return"])
+    assert np.isnan(recent_outcome(empty, source=0, window=4)["episode_return"])
 
 
 def test_recent_outcome_leaves_out_what_began_too_early():
     rings, finished = _written(41)
     since = finished[1][-3][1]
     recent = [episode_return for _, end, length, episode_return in finished[1] if end - length + 1 >= since]
-    outcome = replay.recent_outcome(rings, source=1, window=SLOTS, since=since)
+    outcome = recent_outcome(rings, source=1, window=SLOTS, since=since)
     assert 0 < len(recent) < sum(end >= since for _, end, _, _ in finished[1]) < SLOTS
     np.testing.assert_allclose(outcome["episode_return"], np.mean(recent), rtol=1e-6)
-    assert np.isnan(replay.recent_outcome(rings, source=1, window=SLOTS, since=41)["episode_return"])
+    assert np.isnan(recent_outcome(rings, source=1, window=SLOTS, since=41)["episode_return"])
