@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Int, UInt8
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -69,7 +70,7 @@ def learning_curves(file: Path, settings: Mapping[str, Run], *, delta: float | N
         if name == "generated_episode_return" and "beta" in curves and delta is not None:
             _mark(axes, delta, "delta")
     handles = figure.axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=min(3 * len(names), 8), fontsize="small")
+    _legend(figure, *handles)
     figure.suptitle(title)
     figure.savefig(file, dpi=150)
 
@@ -93,9 +94,9 @@ def comparison(file: Path, panels: Mapping[str, Mapping[str, Run]], *, metrics: 
 def _together(blocks: Sequence[Block], names: Sequence[str]) -> Figure:
     """A panel per block, side by side, a colour per name."""
     count = len(blocks)
-    legend_columns = 3 * count
-    legend_height = 0.25 * -(-len(names) // legend_columns)
-    figure = Figure(figsize=(7 if count == 1 else 5 * count, 4 + legend_height), layout="constrained")
+    width = 7 if count == 1 else 5 * count
+    legend_height = 0.25 * -(-len(names) // _legend_columns(names, width))
+    figure = Figure(figsize=(width, 4 + legend_height), layout="constrained")
     handles = {}
     for axes, (title, runs, metric) in zip(np.atleast_1d(figure.subplots(1, count)), blocks, strict=True):
         for name, run in runs.items():
@@ -103,8 +104,20 @@ def _together(blocks: Sequence[Block], names: Sequence[str]) -> Figure:
         _decorate(axes, metric)
         if title:
             axes.set_title(title, fontsize="medium")
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=legend_columns, fontsize="small")
+    _legend(figure, list(handles.values()), list(handles))
     return figure
+
+
+def _legend(figure: Figure, handles: Sequence[Artist], names: Sequence[str]) -> None:
+    """Below everything else, in as many columns as there is room for."""
+    columns = _legend_columns(names, figure.get_figwidth())
+    figure.legend(handles, names, loc="outside lower center", ncols=columns, fontsize="small")
+
+
+def _legend_columns(names: Sequence[str], width: float) -> int:
+    """How many columns of a legend in small print fit a width in inches."""
+    column = 0.6 + 0.075 * max(map(len, names))
+    return max(1, min(len(names), int(width / column)))
 
 
 def _apart(blocks: Sequence[Block]) -> Figure:

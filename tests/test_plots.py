@@ -45,6 +45,18 @@ def test_comparisons_have_a_panel_per_target_and_curves_a_colour_per_setting(tmp
     assert read(tmp_path / "sweep.png").std() > 0
 
 
+@pytest.mark.parametrize("names", [["dqn"] * 2, ["manipulation_out_of_space_frozen_generator"] * 3, ["one", 60 * "w"]])
+def test_a_legend_is_as_wide_as_the_figure_at_most(names):
+    """However long the names are, unless one alone is wider."""
+    run = (np.arange(1, 6) * 1000, {"target_return": np.zeros((2, 5))})
+    runs = {name + str(index): run for index, name in enumerate(names)}
+    figure = plots._together([("", runs, "target_return")], list(runs))
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.x1
+
+
 def test_many_runs_have_a_small_panel_each_where_they_have_the_metric(tmp_path):
     run = (np.arange(1, 6) * 1000, {"target_return": np.linspace(0, 1, 10).reshape(2, 5)})
     with_beta = (run[0], run[1] | {"beta": np.ones((2, 5))})
