@@ -64,7 +64,8 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
         size = getattr(config, name)
         require(
             size > 0 and size % steps == 0,
-            f"{name} must be a positive multiple of the {steps} environment steps of one iteration, got {size}",
+            f"{name} must be a positive multiple of {steps}, the environment steps of one iteration ({sources} sources of "
+            f"envs_per_source={config.envs_per_source}), got {size}",
         )
     require(
         config.eval_every % config.refresh_every == 0,
@@ -86,7 +87,8 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
     )
     require(
         not learns or (1 <= rounds < math.inf and abs(rounds - round(rounds)) < 1e-6),
-        f"model_updates_per_step must give a whole number of updates per iteration of {steps} steps, got {rounds:g}",
+        f"model_updates_per_step must give a whole number of updates per iteration of {steps} environment steps ({sources} "
+        f"sources of envs_per_source={config.envs_per_source}), got {config.model_updates_per_step:g}, which gives {rounds:g}",
     )
     require(
         not learns or (config.model_batch_size >= 2 and config.model_batch_size % sources == 0),

@@ -27,7 +27,8 @@ class HParams:
       value_learning_rate: Adam step size of both value networks, >= 0 (paper: 3e-4).
       generator_learning_rate: Adam step size of the generator, >= 0 (paper: 3e-4).
       gamma: discount of the Q-learning target, in [0, 1].
-      target_rate: Polyak rate of the target network per policy update, in [0, 1] (the paper names none).
+      target_rate: Polyak rate of the target network (not of the target task) per policy update, in [0, 1] (the paper
+        names none).
       reset_every: environment steps between resets of the Q-network, replay kept, for as long as the kept policy's return on
         the target is not above 0, > 0 (the paper has none: infinite).
       epsilon_start: exploration right after warm-up, in [0, 1].
@@ -55,9 +56,9 @@ class HParams:
       ride_scale: factor on RIDE's reward, >= 0 (its reference 0.1 to 0.5).
       alp_random_share: share of uniform tasks in ALP-GMM, in [0, 1] (its reference 0.2).
       alp_regularisation: added to the diagonal of ALP-GMM's covariances, where every block of a task parameter spans a length
-        of 1, > 0 (scikit-learn 1e-6; below 1e-6 float32 has no Cholesky factors of 204 dimensions).
+        of 1, > 0 (scikit-learn 1e-6; below 1e-6 float32 has no Cholesky factors of 203 dimensions).
       goal_low: GoalGAN's lowest rate of success of a task worth proposing, in [0, 1] (its reference 0.25).
-      goal_high: the highest such rate, in [0, 1] (its reference 0.75).
+      goal_high: GoalGAN's highest rate of success of a task worth proposing, in [0, 1] (its reference 0.75).
       goal_old_share: share of earlier such tasks, proposed again, in [0, 1] (its reference 0.2).
       goal_noise: standard deviation of the noise on GoalGAN's tasks, whose numbers lie in [-1, 1], >= 0 (its reference 0.01).
       goal_learning_rate: RMSProp step size of GoalGAN's two networks, >= 0 (its reference 1e-3).
@@ -169,7 +170,7 @@ class Config:
       judge_parts: whether the discriminator classifies the parts of a rollout one by one, as PatchGAN does those of a picture:
         the initial observation and each transition by themselves; a rollout's score averages their probabilities, of which the
         initial observation's counts half.  Otherwise it classifies rollouts, by the average of their parts' logits (paper).
-      recent_steps: discriminator and values learn from the latest so many steps of each source (paper: 10,000).
+      recent_steps: how many of each source's latest steps discriminator and values learn from (paper: 10,000).
       relative_progress: whether V1 learns from logits centred and scaled to unit spread over the batch, so that progress weighs
         the same against return however sure the discriminator is (paper: no).
       blank_bias: head start of category 0 in the generator's initial grids, in standard deviations of the scores (paper: 0).
@@ -179,7 +180,7 @@ class Config:
         "proportional" sets it to beta_init * 2^((delta - return) / tolerance), within [beta_min, beta_max].
       alp_window: finished episodes that ALP-GMM fits its mixtures to; until there are so many, tasks are uniform (its reference
         250).
-      alp_history: earlier episodes among which it looks for the task nearest to each of these (its reference: all).
+      alp_history: earlier episodes that ALP-GMM searches for the task nearest to each of these (its reference: all).
       alp_fit_every: steps between fits, a multiple of `refresh_every` (its reference: every 250 episodes).
       alp_covariance: "full", or "diagonal" where a task parameter has many more numbers than `alp_window` can tell.
       goal_rollouts: episodes by which GoalGAN judges a task (its reference 2).

@@ -71,7 +71,8 @@ class TaskSpace(Protocol):
     def describe(self, task: Any, target: Any) -> dict[str, Float[Array, ""]]:
         """Scalars worth watching as a curriculum unfolds, of a task alone or beside the target; the space chooses their names.
 
-        NaN says "not defined for this task"; means over tasks skip it.
+        Pictures and tables look for `solution_length`, `feasible` and `goal_distance`.  NaN says "not defined for this task";
+        means over tasks skip it.
         """
         ...
 

@@ -171,14 +171,16 @@ def make_trainer(space: TaskSpace, config: Config) -> Trainer:
             horizon=space.horizon,
             gamma=hparams.gamma,
         )
-        reward, bonus_metrics = bonus.reward(state.bonus, batches, hparams)
         low, high = bonus.return_range(state.bonus, state.replay)
 
         def update(carry: learner.LearnerState, batch: replay.Batch) -> tuple[learner.LearnerState, Metrics]:
-            return learner.update(network, carry, batch, low=low, high=high, hparams=hparams)
+            reward, bonus_metrics = bonus.reward(state.bonus, batch, hparams)
+            batch = batch._replace(reward=reward)
+            carry, metrics = learner.update(network, carry, batch, low=low, high=high, hparams=hparams)
+            return carry, {**metrics, **bonus_metrics}
 
-        learner_state, metrics = _scan(update, state.learner, batches._replace(reward=reward))
-        return state._replace(learner=learner_state), {**metrics, **bonus_metrics}
+        learner_state, metrics = _scan(update, state.learner, batches)
+        return state._replace(learner=learner_state), metrics
 
     def adapt(state: TrainState, clock: Clock, key: Key[Array, ""], hparams: HParams) -> tuple[TrainState, Metrics]:
         def update(carry: tuple[Any, Any, Key[Array, ""]], _: None) -> tuple[tuple[Any, Any, Key[Array, ""]], Metrics]:

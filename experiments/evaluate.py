@@ -16,7 +16,7 @@ from rich.table import Table
 from apt_jax.evaluation import Outcome
 from experiments import episodes, film, runtime, settings
 from experiments.errors import UsageError, exit_with, make_folder
-from experiments.problem import make_problem
+from experiments.problem import import_plugins, make_problem
 from experiments.runner import load_lanes
 
 
@@ -59,6 +59,7 @@ def evaluate(args: Args) -> None:
         raise UsageError("--robot plays the film's episode: say where to put it, --gif FILE")
     make_folder(args.gif)
     experiment = settings.load(args.run_dir)
+    import_plugins(experiment.plugins)
     if args.robot:
         film.check_robot(experiment.space)
     if args.target or args.target_file:

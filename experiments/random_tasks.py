@@ -10,6 +10,7 @@ import tyro
 
 from experiments import plots, runtime
 from experiments.errors import UsageError, exit_with, make_folder
+from experiments.problem import import_plugins
 from experiments.settings import make_space
 
 
@@ -20,6 +21,7 @@ class Args:
     Attributes:
       out: the picture to write.
       space: the task space.
+      plugins: Python modules to import first, which may add task spaces.
       rows: rows of tasks.
       columns: columns of tasks.
       seed: random seed of the tasks.
@@ -27,6 +29,7 @@ class Args:
 
     out: Path
     space: str = "grid_world"
+    plugins: tuple[str, ...] = ()
     rows: int = 3
     columns: int = 8
     seed: int = 0
@@ -39,6 +42,7 @@ def main() -> int:
         raise UsageError(f"--rows and --columns must be at least 1, got {args.rows} and {args.columns}")
     make_folder(args.out)
     runtime.setup()
+    import_plugins(args.plugins)
     space = make_space(args.space)
     keys = jax.random.split(jax.random.key(args.seed), args.rows * args.columns)
     tasks = jax.device_get(jax.jit(jax.vmap(lambda key: space.instantiate(space.sample_uniform(key))))(keys))

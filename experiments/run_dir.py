@@ -134,8 +134,10 @@ def read_metrics(path: Path) -> tuple[Int[np.ndarray, "T"], Curves]:
     """The environment steps of every evaluation that is there for all lanes, and the metrics with the lanes' own columns.
 
     Raises:
-      UsageError: no evaluation yet.
+      UsageError: no such directory, or no evaluation in it yet.
     """
+    if not path.is_dir():
+        raise UsageError(f"{path} is no directory")
     rows = _read_rows(path)
     lanes = len({tuple(row[name] for name in _lane_columns(rows)) for row in rows})
     rows = rows[: len(rows) - len(rows) % max(lanes, 1)]

@@ -76,9 +76,9 @@ class Session:
 
     Attributes:
       run_dir: where everything is written; must be new, empty, or resumed.
-      resume: go on from the run directory's checkpoint; the experiment defaults to what is saved there.
-      preset: the config and hparams to start from, by default fast or what a resumed run was started with, but for a gamma of
-        the space's own and, with fast, what was tuned for the method; other options override single fields.
+      resume: continue the run in the run directory; nothing else needs repeating.
+      preset: where config and hparams start from: fast (the default) or paper; a resumed run keeps its own. The space's own
+        discount comes on top and, with fast, what was tuned for the method. Other options override single fields.
       method: short for --config.method: apt_gen, apt_gen_progress_only, apt_gen_return_only, random, alp_gmm, goal_gan, dqn,
         icm, rnd, ride, or one with a bonus added as in "apt_gen+rnd".
       layout: how the lanes of one device are laid out; by default map on CPU and vmap on accelerators.
@@ -150,10 +150,10 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
         space = saved.space if saved else basis.space
         method = basis.method or basis.config_method or default.config.method
         config, hparams = starting_point(basis.preset or "fast", space, method)
-        default = dataclasses.replace(default, config=dataclasses.replace(config, method=method), hparams=hparams)
+        default = dataclasses.replace(default, config=config, hparams=hparams)
 
     def train(
-        session: Annotated[Session, tyro.conf.arg(name="")],
+        session: Annotated[Session, tyro.conf.arg(name=""), tyro.conf.FlagCreatePairsOff],
         experiment: Annotated[Experiment, tyro.conf.arg(name="")] = dataclasses.replace(default, hparams=HParams()),  # noqa: B008
         hparams: Values = Values(**lanes.to_values(default.hparams)),  # noqa: B008
     ) -> tuple[Experiment, Session]:
@@ -163,7 +163,7 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
         """
         return dataclasses.replace(experiment, hparams=lanes.from_values(dataclasses.asdict(hparams))), session
 
-    experiment, session = tyro.cli(train, args=args, prog="python -m experiments.train", config=(tyro.conf.FlagCreatePairsOff,))
+    experiment, session = tyro.cli(train, args=args, prog="python -m experiments.train")
     if session.method:
         experiment = dataclasses.replace(experiment, config=dataclasses.replace(experiment.config, method=session.method))
     if not experiment.target_file or (saved and basis.target and not basis.target_file):
@@ -176,20 +176,20 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
 
 
 def starting_point(preset: Preset, space: str, method: str) -> tuple[Config, HParams]:
-    """The preset, with the space's own discount (`GAMMA`) and, for preset fast, what was tuned for the method (`TUNED`).
+    """The preset for a method, with the space's own discount (`GAMMA`) and, for preset fast, what was tuned for it (`TUNED`).
 
     Args:
       preset: a name in `PRESETS`.
-      space: a task space's name; unknown ones have nothing of their own.
+      space: a task space's name, not the space itself; unknown ones have nothing of their own.
       method: a method's full name, as in "rnd" or "apt_gen+rnd", which has nothing of "rnd"'s; unknown ones have nothing tuned.
 
     Returns:
-      The preset's `Config`, whose `method` is the preset's still, and the hyper-parameters, a number each.
+      The preset's `Config` with that method, and the hyper-parameters, a number each.
     """
     config, hparams = PRESETS[preset]
     own = {"gamma": GAMMA[space]} if space in GAMMA else {}
     tuned = TUNED.get((space, method), {}) if preset == "fast" else {}
-    return config, dataclasses.replace(hparams, **{**own, **tuned})
+    return dataclasses.replace(config, method=method), dataclasses.replace(hparams, **{**own, **tuned})
 
 
 def make_space(name: str) -> envs.BenchmarkSpace:

@@ -40,8 +40,8 @@ class Signs:
     what generated episodes do return, in which the policy goes on learning.
 
     Attributes:
-      runs: directories of runs with a generator; a run is called by its directory's name.
-      after: columns that are one number average over the evaluations after so many environment steps.
+      runs: directories of runs of apt_gen or its ablations; a run is called by its directory's name.
+      after: columns with a single number are means over the evaluations after so many environment steps.
     """
 
     runs: tuple[Path, ...]
@@ -61,14 +61,16 @@ def table(runs: Sequence[Path], *, after: int = Signs.after) -> str:
     """A Markdown table with a line per seed and setting.
 
     Raises:
-      UsageError: no evaluation yet, a run without a generator, or one that ended before `after`.
+      UsageError: no evaluation yet, a run of another method, or one that ended before `after`.
     """
     rows = []
     for path in runs:
         experiment = settings.load(path)
         env_steps, curves = run_dir.read_metrics(path)
         if "beta" not in curves:
-            raise UsageError(f"{path} has no generator: its method is {experiment.config.method}")
+            raise UsageError(
+                f"{path} is a run of {experiment.config.method}: signs reads what only apt_gen and its ablations write"
+            )
         if env_steps[-1] <= after:
             raise UsageError(f"--after must be below the {env_steps[-1]:,} steps of {path}, got {after:,}")
         for i, lane in enumerate(experiment.lanes):

@@ -174,7 +174,9 @@ def test_correlation():
     a = jnp.array([1.0, 2.0, 4.0])
     np.testing.assert_allclose(apt_gen.correlation(a, 3.0 * a - 1.0), 1.0, rtol=1e-4)
     np.testing.assert_allclose(apt_gen.correlation(a, -a), -1.0, rtol=1e-4)
-    assert apt_gen.correlation(a, jnp.ones(3)) == 0.0
+    np.testing.assert_allclose(apt_gen.correlation(1e-13 * a, 1e-25 * a), 1.0, rtol=1e-4)
+    for constant in (jnp.ones(3), jnp.zeros(3), jnp.full(3, 0.1)):
+        assert apt_gen.correlation(a, constant) == 0.0
 
 
 def test_proposals_do_not_depend_on_how_many_are_drawn_at_once(fresh):

@@ -12,7 +12,7 @@ import pytest
 from apt_jax import replay as rp
 from apt_jax.bonuses import BONUSES, icm, ride, rnd
 from apt_jax.bonuses.base import Step, Stream
-from apt_jax.bonuses.moments import Moments
+from apt_jax.bonuses.moments import MOST, Moments
 from apt_jax.config import Config, HParams
 from apt_jax.lanes import make_program, stack_hparams
 from apt_jax.networks import Dynamics
@@ -52,6 +52,13 @@ def test_moments_oracle():
     moments = Moments.start().extend(jnp.array([1.0, 2.0, 3.0, 4.0]))
     np.testing.assert_allclose(moments, (2.4999375, 1.25014999, 4.0001), rtol=1e-6)
     np.testing.assert_allclose(moments.extend(jnp.array([10.0]))[:2], (3.9999200, 10.0001400), rtol=1e-6)
+
+
+def test_moments_go_on_when_float32_cannot_count_further():
+    moments = Moments(jnp.float32(0.0), jnp.float32(4.0), jnp.float32(MOST))
+    for _ in range(2):
+        moments = moments.extend(jnp.tile(jnp.array([-1.0, 1.0]), 2_500_000))
+    np.testing.assert_allclose(moments, (0.0, 1.0 + 3.0 / 4.0, MOST), rtol=1e-6)
 
 
 def test_forward_filter_oracle():
@@ -203,6 +210,27 @@ def test_what_the_warm_up_paid_widens_no_clip():
         assert low == -0.5
         highest.append(float(high))
     assert highest == [np.inf, np.inf, np.inf, 3.0]
+
+
+def test_the_clip_reaches_what_the_environment_paid_in_the_warm_up():
+    """Else nothing could be worth as much as the success that random play had."""
+    stream = Stream(jnp.zeros((1, 1)), jnp.float32(-0.3))
+    for paid, expected in ((0.95, 0.95), (-0.4, -0.3)):
+        bounds = stream.bounds(SimpleNamespace(returns=ReturnRange(jnp.float32(-0.4), jnp.float32(paid))))
+        np.testing.assert_allclose(bounds, [-0.4, expected])
+
+
+def test_rnds_unit_waits_for_bonuses_to_deviate():
+    """One environment's first bonus alone deviates by nothing, and would be worth a hundred."""
+    bonus = BONUSES["rnd"](Lock(), CONFIG)
+    state = bonus.init(jax.random.key(0), jnp.zeros((1, 1)), HParams())
+    steps = lock_steps([0], [1]).transition
+    batch = rp.Batch(steps.obs, steps.action, steps.reward, steps.next_obs, steps.reward)
+    fresh = bonus.reward(state, batch, HParams())[0]
+    seen = state._replace(scale=state.scale.extend(jnp.ones(1)))
+    np.testing.assert_allclose(bonus.reward(seen, batch, HParams())[0], fresh)
+    many = state._replace(scale=state.scale.extend(jnp.array([1.0, 5.0] * 10)))
+    np.testing.assert_allclose(bonus.reward(many, batch, HParams())[0], fresh / 2.0, rtol=1e-3)
 
 
 def test_the_null_bonus_computes_and_keeps_nothing():

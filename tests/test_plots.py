@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import envs
 from experiments import plots, random_tasks
 from experiments.errors import UsageError
 
@@ -97,6 +98,16 @@ def draw_random_tasks(monkeypatch, *options):
     monkeypatch.setattr("sys.argv", ["random_tasks", *options])
     monkeypatch.setattr("experiments.runtime.setup", lambda: None)
     return random_tasks.main()
+
+
+def test_random_tasks_may_be_of_a_plug_in_space(tmp_path, monkeypatch):
+    options = ["--out", str(tmp_path / "tasks.png"), "--space", "meadow", "--rows", "1", "--columns", "1"]
+    monkeypatch.setattr(envs, "SPACES", dict(envs.SPACES))
+    with pytest.raises(UsageError, match="unknown task space 'meadow'"):
+        draw_random_tasks(monkeypatch, *options)
+    (tmp_path / "meadows.py").write_text("import envs\n\nenvs.SPACES['meadow'] = envs.SPACES['grid_world']\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert draw_random_tasks(monkeypatch, *options, "--plugins", "meadows") == 0
 
 
 def test_random_tasks_differ_by_seed_alone(tmp_path, monkeypatch):

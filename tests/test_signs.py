@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from apt_jax.config import HParams
-from experiments import report, signs
+from experiments import report, run_dir, signs
 from experiments.errors import UsageError, make_folder
+
+ROOT = Path(__file__).parents[1]
 
 
 def test_over_time_takes_the_mean_of_the_five_values_up_to_each_quarter_and_skips_gaps():
@@ -34,6 +37,15 @@ def test_a_row_averages_what_lies_after_the_given_step():
     cells = signs.cells("run", "3", env_steps, curves, 4_000, HParams(beta_min=0.125, beta_max=8.0))
     assert cells[:4] == ("run", "3", "0.50 (0.50 to 0.50)", "50%, 25%")
     assert cells[4:] == ("-", "-", "-", "-", "0.25", "-0.50", "+0.10", "-0.25 (0.25; nan)")
+
+
+def test_what_signs_cannot_read_is_named(tmp_path):
+    goal_gan = ROOT / "experiments/results/methods_A/goal_gan"
+    for path, words in ((goal_gan, "goal_gan is a run of goal_gan: signs reads"), (tmp_path / "none", "none holds no run")):
+        with pytest.raises(UsageError, match=words):
+            signs.table([path])
+    with pytest.raises(UsageError, match="none is no directory"):
+        run_dir.read_metrics(tmp_path / "none")
 
 
 def test_runs_of_one_name_are_not_mixed_up(tmp_path):

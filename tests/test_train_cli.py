@@ -74,6 +74,8 @@ def start_run(path: Path, *options: str) -> Experiment:
         ("--target a", "closest is 'A'"),
         ("--method apt-gen", "closest is 'apt_gen'"),
         ("--config.model-updates-per-step inf", "whole number of updates per iteration"),
+        ("--config.envs-per-source 1", r"per iteration of 2 environment steps .*, got 0.2, which gives 0.4"),
+        ("--config.envs-per-source 3", r"multiple of 6, .* \(2 sources of envs_per_source=3\), got 10000"),
         ("--config.batch-size 5", "batch_size must be a positive multiple"),
         ("--resume", "holds no run"),
     ],
@@ -95,6 +97,13 @@ def test_options_override_the_preset(tmp_path):
     config, hparams = PRESETS["fast"]
     assert experiment.config == dataclasses.replace(config, batch_size=64)
     assert experiment.hparams == hparams.replace(delta=0.3)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize(("option", "value"), [("--config.judge-parts", True), ("--config.no-judge-parts", False)])
+def test_a_switch_has_both_names_whatever_the_preset(tmp_path, preset, option, value):
+    experiment, _ = settings.parse(["--run-dir", str(tmp_path), "--preset", preset, option])
+    assert experiment.config.judge_parts == value
 
 
 @pytest.mark.parametrize("space", ["manipulation", "manipulation_sawyer"])
@@ -127,7 +136,10 @@ def test_what_is_tuned_exists(tmp_path, space, method):
     envs.make(space)
     assert method in METHODS
     words = ["--run-dir", str(tmp_path), "--preset", "fast", "--space", space, "--method", method]
-    assert settings.parse(words)[0].hparams != settings.starting_point("fast", space, "apt_gen")[1]
+    experiment = settings.parse(words)[0]
+    assert (experiment.config, experiment.hparams) == settings.starting_point("fast", space, method)
+    assert experiment.config.method == method
+    assert experiment.hparams != settings.starting_point("fast", space, "apt_gen")[1]
 
 
 def test_a_file_does_not_hide_a_target_of_its_name(tmp_path, monkeypatch):

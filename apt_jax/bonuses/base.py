@@ -107,13 +107,13 @@ class Stream(NamedTuple):
         return Stream(jnp.where(done, fresh, episode_return), jnp.maximum(self.highest, highest))
 
     def bounds(self, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """What the next values are clipped to: above by `highest`, unbounded before the first episode.
+        """What the next values are clipped to: above by `highest`, unbounded before the first episode that counts.
 
-        Below by the lowest return that the environment paid: a bonus is never negative, and a discounted value may lie below
-        every undiscounted return that has bonuses in it.
+        A bonus is never negative: `highest` is at least what the environment paid for any episode of the replay, the warm-up's
+        too.  Below by the lowest of these, since a discounted value may lie below every undiscounted return with bonuses in it.
         """
-        low, _ = replay.returns.bounds()
-        return low, jnp.where(jnp.isneginf(self.highest), jnp.inf, self.highest)
+        low, paid = replay.returns.bounds()
+        return low, jnp.where(jnp.isneginf(self.highest), jnp.inf, jnp.maximum(self.highest, paid))
 
 
 def pay(batch: Batch, bonus: Float[Array, "..."]) -> tuple[Float[Array, "..."], Metrics]:

@@ -7,9 +7,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+MOST = 1e7
+"""Samples that count at most; float32 has no number for 2^24 + 1 of them.  From there on the latest weigh a little more."""
+
 
 class Moments(NamedTuple):
-    """Mean, variance and number of the samples so far; before the first 0, 1 and almost none."""
+    """Mean, variance and number of the samples so far, up to `MOST`; before the first 0, 1 and almost none."""
 
     mean: Float[Array, "..."]
     variance: Float[Array, "..."]
@@ -23,7 +26,8 @@ class Moments(NamedTuple):
     def extend(self, new: Float[Array, "n ..."]) -> Moments:
         """With n more samples (Chan et al. 1979)."""
         n = jnp.float32(new.shape[0])
-        total = self.samples + n
+        before = jnp.minimum(self.samples, MOST - n)
+        total = before + n
         shift = jnp.mean(new, axis=0) - self.mean
-        squares = self.variance * self.samples + jnp.var(new, axis=0) * n + shift**2 * (self.samples * n / total)
+        squares = self.variance * before + jnp.var(new, axis=0) * n + shift**2 * (before * n / total)
         return Moments(self.mean + shift * (n / total), squares / total, total)

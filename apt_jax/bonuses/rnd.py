@@ -27,6 +27,9 @@ DISCOUNT = 0.99
 CLIP = 5.0
 """Bound of normalised observations, in deviations."""
 
+FEW = 10
+"""Bonuses seen before their deviation is the unit, until then 1: a single environment's first one deviates by nothing."""
+
 EPSILON = 1e-8
 """Added to variances: some inputs never change."""
 
@@ -79,7 +82,7 @@ def make(space: TaskSpace, config: Config) -> Bonus:
         return jnp.mean((apply(predictor_network, predictor, features) - wanted) ** 2, axis=-1)
 
     def bonus(state: RndState, steps: Steps, hparams: HParams) -> Float[Array, "..."]:
-        unit = jnp.sqrt(state.scale.variance + EPSILON)
+        unit = jnp.where(state.scale.samples < FEW, 1.0, jnp.sqrt(state.scale.variance + EPSILON))
         return hparams.rnd_scale * error(state, state.predictor, steps.next_obs) / unit
 
     def annotate(state: RndState, step: Step, hparams: HParams) -> tuple[RndState, Any]:

@@ -3,7 +3,7 @@
 Absolute learning progress (ALP) of an episode is how far its return lies from that of the nearest earlier task.  Mixtures are
 fitted to the latest tasks with their progress, and tasks are drawn from components in proportion to the progress there.
 
-In many dimensions that is a weak guide: a full covariance of Grid-World's 203 numbers and the progress has 20,910 entries, to
+In many dimensions that is a weak guide: a full covariance of Grid-World's 202 numbers and the progress has 20,706 entries, to
 be told from 250 episodes.  The weakness is the method's own.
 """
 

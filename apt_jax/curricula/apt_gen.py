@@ -220,6 +220,14 @@ def explore(spec: Spec, w: Params, key: Key[Array, ""], hparams: HParams) -> Par
 
 
 def correlation(a: Float[Array, "n"], b: Float[Array, "n"]) -> Float[Array, ""]:
-    """Pearson correlation, 0 where either side is constant."""
-    a, b = a - jnp.mean(a), b - jnp.mean(b)
-    return jnp.sum(a * b) / (jnp.sqrt(jnp.sum(a**2) * jnp.sum(b**2)) + 1e-6)
+    """Pearson correlation, 0 where either side is constant up to rounding; on any scale, as values near 0 are squared late."""
+
+    def direction(x: Float[Array, "n"]) -> Float[Array, "n"]:
+        """Of unit length, or 0."""
+        centred = x - jnp.mean(x)
+        largest = jnp.max(jnp.abs(centred))
+        varies = largest > 1e-6 * jnp.max(jnp.abs(x))
+        centred = centred / jnp.where(varies, largest, 1.0)
+        return jnp.where(varies, centred / jnp.linalg.norm(jnp.where(varies, centred, 1.0)), 0.0)
+
+    return jnp.sum(direction(a) * direction(b))
