@@ -24,7 +24,7 @@ from experiments.problem import make_problem
 from experiments.settings import Experiment, Session
 from experiments.train import start_jax, train
 
-OWN = ("run-dir", "resume", "method", "target", "target-file", "config.method")
+OWN = ("run-dir", "resume", "method", "target", "config.method")
 """Options of `experiments.train` that are decided here."""
 
 

@@ -27,7 +27,6 @@ class Args:
     Attributes:
       run_dir: a directory that experiments.train wrote.
       target: a target's name, or a file that describes one; by default the one trained on.
-      target_file: a file that describes the target task, whatever `target` says.
       episodes: greedy episodes per lane.
       seed: random seed of the episodes' initial states.
       gif: where to put a film of the best lane.
@@ -36,7 +35,6 @@ class Args:
 
     run_dir: Path
     target: str | None = None
-    target_file: Path | None = None
     episodes: int = 50
     seed: int = 0
     gif: Path | None = None
@@ -62,10 +60,9 @@ def evaluate(args: Args) -> None:
     import_plugins(experiment.plugins)
     if args.robot:
         film.check_robot(experiment.space)
-    if args.target or args.target_file:
-        target = args.target or experiment.target
-        file = args.target_file or settings.target_path(experiment.space, target)
-        experiment = dataclasses.replace(experiment, target=target, target_file=file)
+    if args.target:
+        file = settings.target_path(experiment.space, args.target)
+        experiment = dataclasses.replace(experiment, target=args.target, target_file=file)
     problem = make_problem(experiment)
     states, clock, _ = load_lanes(args.run_dir, experiment, problem.trainer)
     policies = jax.device_put(states.policy, jax.local_devices()[0])

@@ -31,14 +31,12 @@ class Args:
     Attributes:
       out: the GIF to write.
       target: a target's name, or a file that describes it.
-      target_file: a file that describes the target task, whatever `target` says.
       seed: random seed of the goal's place.
       above: show the table from above, one picture per push, in any case.
     """
 
     out: Path
     target: str = "A"
-    target_file: Path | None = None
     seed: int = 0
     above: bool = False
 
@@ -58,7 +56,7 @@ def film(args: Args) -> None:
         space = Space()
     except ValueError as error:
         raise UsageError(str(error)) from error
-    file = args.target_file or target_path(space.name, args.target)
+    file = target_path(space.name, args.target)
     task = load_target(space.name, args.target, file)
     actions = solve(task, space.goal_jitter) if file else DEMONSTRATIONS[args.target]
     if actions is None:

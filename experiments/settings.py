@@ -47,7 +47,7 @@ class Experiment:
     Attributes:
       space: the task space: grid_world, manipulation, or manipulation_sawyer.
       target: the target task's name in the space, or a file that describes it.
-      target_file: a file that describes the target task, whatever `target` says.
+      target_file: the file that `target` is, if it is one; of a run, what the run directory has kept of it.
       seeds: one lane of the compiled program each, for every combination of swept hyper-parameters.
       env_steps: environment steps of all sources together, warm-up included.
       plugins: Python modules to import first, which may add methods of their own to those that come with apt_jax.
@@ -57,7 +57,7 @@ class Experiment:
 
     space: str = "grid_world"
     target: str = "A"
-    target_file: Path | None = None
+    target_file: tyro.conf.Suppress[Path | None] = None
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     env_steps: int = 100_000
     plugins: tuple[str, ...] = ()
@@ -133,7 +133,6 @@ class _Basis:
     config_method: Annotated[str | None, tyro.conf.arg(name="config.method")] = None
     space: str = Experiment.space
     target: str | None = None
-    target_file: Path | None = None
 
 
 def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
@@ -166,9 +165,10 @@ def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
     experiment, session = tyro.cli(train, args=args, prog="python -m experiments.train")
     if session.method:
         experiment = dataclasses.replace(experiment, config=dataclasses.replace(experiment.config, method=session.method))
-    if not experiment.target_file or (saved and basis.target and not basis.target_file):
+    if not saved or basis.target:
         file = target_path(experiment.space, experiment.target)  # named again, it may not be what the run has kept of it
-        experiment = dataclasses.replace(experiment, target_file=file or experiment.target_file)
+        kept = saved.target_file if saved and saved.target == experiment.target else None
+        experiment = dataclasses.replace(experiment, target_file=file or kept)
     check(experiment, session)
     if saved:
         check_resumable(saved, experiment)
@@ -214,7 +214,7 @@ def check(experiment: Experiment, session: Session) -> None:
     if not 0 <= min(experiment.seeds) <= max(experiment.seeds) < 2**31:
         raise UsageError(f"--seeds must lie in [0, 2^31), got {' '.join(map(str, experiment.seeds))}")
     if experiment.target_file and not experiment.target_file.is_file():
-        raise UsageError(f"--target-file {experiment.target_file} is no file")
+        raise UsageError(f"{experiment.target_file} is no file")
     for name, values in lanes.swept(experiment.hparams).items():
         if not values or len(set(values)) != len(values):
             given = " ".join(f"{value:g}" for value in values) or "none"

@@ -58,7 +58,7 @@ def start_run(path: Path, *options: str) -> Experiment:
         ("--distributed --coordinator-address node1", "must be a host and a port as in node1:1234, got node1"),
         ("--distributed --num-processes 2 --process-id 2", "--process-id must be from 0 to .* got 2 of 2"),
         ("--checkpoint-every 0", "--checkpoint-every must be at least 1"),
-        ("--target-file missing.txt", "missing.txt is no file"),
+        ("--target missing.txt", "missing.txt is no file"),
         ("--env-steps 10000", r"warmup_steps \(10000\) .* is 11000"),
         ("--env-steps 2147484000", r"--env-steps must be below 2\^31, got 2147484000"),
         ("--hparams.learning-rate inf", "learning_rate must be finite and at least 0, got inf"),
@@ -226,24 +226,15 @@ def test_resuming_names_every_difference(tmp_path):
         settings.parse(["--run-dir", str(tmp_path), "--resume", "--env-steps", "1000"])
 
 
-def test_a_run_keeps_its_target_file(tmp_path):
-    file = tmp_path / "mine.txt"
-    file.write_text("first")
-    start_run(tmp_path / "run", "--target-file", str(file))
-    resume = ["--run-dir", str(tmp_path / "run"), "--resume"]
-    assert settings.parse([*resume, "--target-file", str(file)])[0].target == "A"
-    file.write_text("second")
-    assert settings.parse(resume)[0].target_file == tmp_path / "run" / "target.txt"
-    with pytest.raises(UsageError, match=r"target_file \(saved first, asked second\)"):
-        settings.parse([*resume, "--target-file", str(file)])
-
-
 def test_a_target_file_named_again_is_the_one_that_the_run_has_kept(tmp_path):
     file = tmp_path / "mine.txt"
     file.write_text("first")
     start_run(tmp_path / "run", "--target", str(file))
     resume = ["--run-dir", str(tmp_path / "run"), "--resume", "--target", str(file)]
     assert settings.parse(resume)[0].target == str(file)
+    assert settings.parse(resume[:-2])[0].target_file == tmp_path / "run" / "target.txt"
+    with pytest.raises(UsageError, match=r"target \(saved of a file, asked B\)"):
+        settings.parse([*resume[:-1], "B"])
     copy = tmp_path / "copy.txt"
     copy.write_text("first")
     settings.parse([*resume[:-1], str(copy)])
