@@ -33,10 +33,11 @@ TUNED: Mapping[tuple[str, str], Mapping[str, float]] = {
     ("grid_world", "dqn"): {"gamma": 0.998},
     ("grid_world", "random"): {"gamma": 0.998},
     ("grid_world", "rnd"): {"rnd_scale": 0.1},
+    ("grid_world", "icm"): {"icm_scale": 0.0003},
 }
 """Baselines that learn better with other hyper-parameters than preset fast has for all, by space and method.
 
-Found by the search of experiments/NOTES.md, section 20; APT-Gen keeps one setting for every target.
+Found by the searches of experiments/NOTES.md, sections 20 and 28; APT-Gen keeps one setting for every target.
 """
 
 
