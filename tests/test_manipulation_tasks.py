@@ -74,7 +74,7 @@ class TestTargets:
 
 
 class TestSolver:
-    @pytest.mark.parametrize("name", ["C", "out_of_space"])
+    @pytest.mark.parametrize("name", TARGETS)
     def test_it_finds_the_demonstrations(self, name):
         assert solve(envs.load_target("manipulation", name), SPACE.goal_jitter) == list(DEMONSTRATIONS[name])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import functools
 
 import jax
@@ -207,8 +206,10 @@ class TestOption:
 
 
 def test_the_arm_in_mjx_goes_through_the_whole_program():
-    """Traced, not compiled; what a curriculum does is the same in every space."""
+    """Traced, not compiled."""
     config, hparams = PRESETS["fast"]
-    trainer = make_trainer(envs.make("manipulation_sawyer"), dataclasses.replace(config, method="dqn"))
+    trainer = make_trainer(envs.make("manipulation_sawyer"), config)
     start = jax.eval_shape(trainer.init, jax.random.key(0), envs.load_target("manipulation_sawyer", "B"), hparams)
-    assert jax.eval_shape(trainer.chunk, start, Clock.start(), hparams)[0] == start
+    warm = jax.eval_shape(trainer.warmup, start, Clock.start(), hparams)
+    assert jax.eval_shape(trainer.chunk, *warm, hparams)[:2] == warm
+    assert warm[0] == start

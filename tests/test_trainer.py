@@ -106,9 +106,9 @@ PAIRS = [
     name if bonus == "none" else f"{name}+{bonus}"
     for name, method in METHODS.items()
     for bonus in BONUSES
-    if method.bonus == "none" and (bonus == "none" or not name.endswith("_only"))
+    if method.bonus == "none"
 ]
-"""Every curriculum alone and with every bonus, but for the ablations, which compute what `apt_gen` does."""
+"""Every curriculum alone and with every bonus."""
 
 
 def assert_makes_a_program(trainer):

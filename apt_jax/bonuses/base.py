@@ -109,8 +109,8 @@ class Stream(NamedTuple):
     def bounds(self, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """What the next values are clipped to: above by `highest`, unbounded before the first episode that counts.
 
-        A bonus is never negative: `highest` is at least what the environment paid for any episode of the replay, the warm-up's
-        too.  Below by the lowest of these, since a discounted value may lie below every undiscounted return with bonuses in it.
+        Not below what the environment paid for any episode, the warm-up's too, since a bonus is never negative.  Below by the
+        lowest of these, since a discounted value may lie below every undiscounted return with bonuses in it.
         """
         low, paid = replay.returns.bounds()
         return low, jnp.where(jnp.isneginf(self.highest), jnp.inf, jnp.maximum(self.highest, paid))
