@@ -34,6 +34,7 @@ TUNED: Mapping[tuple[str, str], Mapping[str, float]] = {
     ("grid_world", "random"): {"gamma": 0.998},
     ("grid_world", "rnd"): {"rnd_scale": 0.1},
     ("grid_world", "icm"): {"icm_scale": 0.0003},
+    ("grid_world", "ride"): {"ride_scale": 0.003},
 }
 """Baselines that learn better with other hyper-parameters than preset fast has for all, by space and method.
 
