@@ -85,7 +85,9 @@ def main() -> int:
     for _ in range(args.repeats):
         with tempfile.TemporaryDirectory() as cache:
             for kind in starts:
-                starts[kind].append(_measure.in_new_process(start, Path(cache), args, requested=time.time()))
+                latest = _measure.in_new_process(start, Path(cache), args, requested=time.time())
+                print(f"{kind}: first chunk done after {latest.first_chunk:.1f} s", flush=True)
+                starts[kind].append(latest)
     imports = {name: time_process(*arguments, repeats=args.repeats) for name, arguments in IMPORTS.items()}
     columns: dict[str, Callable[[Start], float]] = {
         "process and imports, s": lambda s: s.imports,
