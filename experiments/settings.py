@@ -35,10 +35,17 @@ TUNED: Mapping[tuple[str, str], Mapping[str, float]] = {
     ("grid_world", "rnd"): {"rnd_scale": 0.1},
     ("grid_world", "icm"): {"icm_scale": 0.0003},
     ("grid_world", "ride"): {"ride_scale": 0.003},
+    ("manipulation", "dqn"): {"gamma": 0.92},
+    ("manipulation", "random"): {"gamma": 0.92},
+    ("manipulation", "alp_gmm"): {"alp_random_share": 0.5},
+    ("manipulation", "rnd"): {"gamma": 0.92, "rnd_scale": 0.1},
+    ("manipulation", "icm"): {"icm_scale": 0.003},
+    ("manipulation", "ride"): {"ride_scale": 0.03},
 }
 """Baselines that learn better with other hyper-parameters than preset fast has for all, by space and method.
 
-Found by the searches of experiments/NOTES.md, sections 20 and 28; APT-Gen keeps one setting for every target.
+Found on target A of each space by the searches of experiments/NOTES.md, sections 20, 28 and 30; APT-Gen keeps one setting for
+every target.
 """
 
 
