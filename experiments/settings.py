@@ -38,6 +38,7 @@ TUNED: Mapping[tuple[str, str], Mapping[str, float]] = {
     ("manipulation", "dqn"): {"gamma": 0.92},
     ("manipulation", "random"): {"gamma": 0.92},
     ("manipulation", "alp_gmm"): {"alp_random_share": 0.5},
+    ("manipulation", "goal_gan"): {"goal_noise": 0.1},
     ("manipulation", "rnd"): {"gamma": 0.92, "rnd_scale": 0.1},
     ("manipulation", "icm"): {"icm_scale": 0.003},
     ("manipulation", "ride"): {"ride_scale": 0.03},
