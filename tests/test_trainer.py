@@ -6,6 +6,7 @@ import dataclasses
 import functools
 from typing import ClassVar, NamedTuple
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -281,9 +282,16 @@ def test_diversity_sees_a_collapse_of_one_modality():
     np.testing.assert_allclose(collapsed["probe_entropy_paint"], 0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("layout", ["map", "vmap"])
-def test_a_seed_alone_equals_the_same_seed_among_others(layout):
-    """Float reassociation is the only difference allowed; on two devices five lanes also exercise the padding."""
+@pytest.fixture
+def smooth(monkeypatch):
+    """No network has a kink: batched products round otherwise, and a ReLU at its kink makes another gradient of that (of 20 seeds,
+    one came to differ by 4e-3 within 90 updates).
+    """
+    monkeypatch.setattr(nn, "relu", nn.silu)
+    monkeypatch.setitem(globals(), "program", functools.cache(program.__wrapped__))
+
+
+def assert_seeds_alone_equal_themselves_among_others(layout):
     cfg, seeds = config(EVERYTHING), [3, 4, 5, 6, 7]
     several, _, history = run(cfg, seeds, layout=layout)
     # Metrics stay on the devices of their lanes: to bring them together, devices would have to wait for each other.
@@ -291,6 +299,15 @@ def test_a_seed_alone_equals_the_same_seed_among_others(layout):
     for lane, seed in enumerate(seeds):
         alone, _, _ = run(cfg, [seed])
         assert_lane_equal(several, lane, alone)
+
+
+def test_a_seed_alone_equals_the_same_seed_among_others():
+    """Float reassociation is the only difference allowed; on two devices five lanes also exercise the padding."""
+    assert_seeds_alone_equal_themselves_among_others("map")
+
+
+def test_a_seed_alone_equals_the_same_seed_of_a_batch(smooth):
+    assert_seeds_alone_equal_themselves_among_others("vmap")
 
 
 @pytest.mark.parametrize("layout", ["map", "vmap"])
