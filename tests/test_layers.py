@@ -10,6 +10,7 @@ import pytest
 from jax import lax
 
 from apt_jax.networks.layers import Conv, ConvTranspose
+from apt_jax.networks.matmul import matmul
 from apt_jax.networks.spectral import init_singular_vectors, spectral_normalize
 
 # Each program runs a few times on small arrays, so compile fast rather than run fast.
@@ -33,6 +34,25 @@ def assert_same_function(ours, reference, *args):
     (values, gradients), (expected_values, expected_gradients) = run(*args)
     chex.assert_trees_all_close(values, expected_values, atol=1e-5)
     chex.assert_trees_all_close(gradients, expected_gradients, atol=1e-4)
+
+
+SHAPES = {"as it is": (6, 9, 8), "rows copied": (6, 16, 32), "gradient copied": (20, 48, 4)}
+"""Rows, inputs and outputs of products whose weights' gradient is computed in different ways."""
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+@pytest.mark.parametrize("batched", [(None, None), (None, 0), (0, None), (0, 0)])
+def test_matmul_equals_the_operator(shape, batched):
+    rows, inputs, outputs = shape
+    sizes = (2, rows // 2, inputs), (inputs, outputs)
+    batch = [() if axis is None else (3,) for axis in batched]
+    keys = jax.random.split(jax.random.key(0))
+    x, w = (jax.random.normal(key, n + size) for key, n, size in zip(keys, batch, sizes, strict=True))
+
+    def over_batch(function):
+        return function if batched == (None, None) else jax.vmap(function, in_axes=batched)
+
+    assert_same_function(over_batch(matmul), over_batch(lambda x, w: jnp.einsum("abi,io->abo", x, w)), x, w)
 
 
 @pytest.mark.parametrize("stride", [1, 2])

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from apt_jax.networks.encoders import ENCODING_SIZE, Encoder, Head, observation_features
+from apt_jax.networks.layers import Dense
 from apt_jax.specs import Obs, Spec
 
 
@@ -30,8 +31,8 @@ class Discriminator(nn.Module):
         self.init_encoder = Encoder(self.obs_spec)
         self.init_head = Head(1)
         self.state_encoder = Encoder(self.obs_spec)
-        self.action_encoder = nn.Dense(ENCODING_SIZE)
-        self.reward_encoder = nn.Dense(ENCODING_SIZE)
+        self.action_encoder = Dense(ENCODING_SIZE)
+        self.reward_encoder = Dense(ENCODING_SIZE)
         self.step_head = Head(1)
 
     def score_init(self, obs: Obs) -> Float[Array, "*batch"]:

@@ -6,6 +6,7 @@ import flax.linen as nn
 from jaxtyping import Array, Float
 
 from apt_jax.networks.encoders import MERGE_SIZE, Encoder, Features, Head
+from apt_jax.networks.layers import Dense
 from apt_jax.specs import Spec
 
 
@@ -24,5 +25,5 @@ class Distillation(nn.Module):
     def __call__(self, features: Features) -> Float[Array, "*batch 128"]:
         x = Head(MERGE_SIZE, name="head")(Encoder(self.obs_spec, name="encoder")(features))
         for _ in range(2 if self.deeper else 0):
-            x = nn.Dense(MERGE_SIZE)(nn.relu(x))
+            x = Dense(MERGE_SIZE)(nn.relu(x))
         return x

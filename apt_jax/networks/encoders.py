@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from apt_jax.networks.layers import Conv
+from apt_jax.networks.layers import Conv, Dense
 from apt_jax.specs import Grid, Modality, Obs, Params, Spec, Table, Vector
 
 ENCODING_SIZE = 64
@@ -75,7 +75,7 @@ class Encoder(nn.Module):
         encodings = []
         for name, modality in self.spec.items():
             x = GridStack(name=f"{name}_stack")(features[name]) if isinstance(modality, Grid) else features[name]
-            encodings.append(nn.relu(nn.Dense(ENCODING_SIZE, name=name)(x)))
+            encodings.append(nn.relu(Dense(ENCODING_SIZE, name=name)(x)))
         return jnp.concatenate(encodings, axis=-1)
 
 
@@ -86,5 +86,5 @@ class Head(nn.Module):
 
     @nn.compact
     def __call__(self, encoding: Float[Array, "*batch encoding"]) -> Float[Array, "*batch outputs"]:
-        hidden = nn.relu(nn.Dense(MERGE_SIZE, name="merge")(encoding))
-        return nn.Dense(self.outputs, name="output")(hidden)
+        hidden = nn.relu(Dense(MERGE_SIZE, name="merge")(encoding))
+        return Dense(self.outputs, name="output")(hidden)

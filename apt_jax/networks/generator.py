@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from apt_jax.networks.encoders import CHANNELS, ENCODING_SIZE
-from apt_jax.networks.layers import Conv, ConvTranspose
+from apt_jax.networks.layers import Conv, ConvTranspose, Dense
 from apt_jax.specs import Grid, Params, Spec, Table, Vector
 
 OUTPUT_NORM = "output_norm"
@@ -39,7 +39,7 @@ class Generator(nn.Module):
     @nn.compact
     def __call__(self, z: Float[Array, "batch noise"], *, train: bool) -> Params:
         norm = partial(nn.BatchNorm, use_running_average=not train, momentum=self.momentum)
-        hidden = nn.Dense(ENCODING_SIZE, use_bias=False, name="noise")(z)
+        hidden = Dense(ENCODING_SIZE, use_bias=False, name="noise")(z)
         hidden = nn.relu(norm(name="noise_norm")(hidden))
         w = {}
         for name, modality in self.param_spec.items():
@@ -61,7 +61,7 @@ class VectorHead(nn.Module):
 
     @nn.compact
     def __call__(self, hidden: Float[Array, "batch hidden"]) -> Float[Array, "batch size"]:
-        logits = self.norm(name=OUTPUT_NORM)(nn.Dense(self.vector.size, use_bias=False)(hidden))
+        logits = self.norm(name=OUTPUT_NORM)(Dense(self.vector.size, use_bias=False)(hidden))
         return self.vector.low + (self.vector.high - self.vector.low) * nn.sigmoid(logits)
 
 
@@ -93,7 +93,7 @@ def stream(
     Boards whose sides are no multiple of four are cut out of the next larger one.
     """
     shape = (-(-height // 4), -(-width // 4), CHANNELS)
-    x = nn.relu(norm()(nn.Dense(prod(shape), use_bias=False)(hidden))).reshape(-1, *shape)
+    x = nn.relu(norm()(Dense(prod(shape), use_bias=False)(hidden))).reshape(-1, *shape)
     for _ in range(2):
         x = nn.relu(norm()(ConvTranspose(CHANNELS)(x)))
     return x[:, :height, :width]

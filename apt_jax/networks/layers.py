@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from apt_jax.networks.matmul import matmul
+
 KERNEL_SIZE = 3
 
 
@@ -72,12 +74,12 @@ class Conv(nn.Module):
         matrix = banded_kernel(kernel.reshape(KERNEL_SIZE, KERNEL_SIZE, channels, self.features), width, self.stride)
         patches = row_patches(x, self.stride)
         out_height = patches.shape[-2]
-        y = patches.reshape(prod(batch) * out_height, -1) @ matrix
-        y = y.reshape(*batch, out_height, -1, self.features)
-        if not self.use_bias:
-            return y
-        bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
-        return y + bias.reshape((1,) * (y.ndim - 1) + (-1,))
+        y = matmul(patches.reshape(prod(batch) * out_height, -1), matrix)
+        if self.use_bias:
+            bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
+            # As wide as a row: added pixel by pixel it is not vectorised on CPU.
+            y = y + jnp.concatenate([bias] * (y.shape[-1] // self.features))[None]
+        return y.reshape(*batch, out_height, -1, self.features)
 
 
 def subpixel_kernel(kernel: Float[Array, "c_in 3 3 c_out"]) -> Float[Array, "4*c_in 4*c_out"]:
@@ -115,6 +117,27 @@ class ConvTranspose(nn.Module):
 
         padded = jnp.pad(x, [(0, 0)] * len(batch) + [(1, 0), (1, 0), (0, 0)])
         sources = [padded[..., 1 - i : height + 1 - i, 1 - j : width + 1 - j, :] for i in range(2) for j in range(2)]
-        y = jnp.concatenate(sources, axis=-1).reshape(-1, 4 * channels) @ matrix
+        y = matmul(jnp.concatenate(sources, axis=-1).reshape(-1, 4 * channels), matrix)
         y = y.reshape(*batch, height, width, 2, 2, self.features).swapaxes(-4, -3)
         return y.reshape(*batch, 2 * height, 2 * width, self.features)
+
+
+class Dense(nn.Module):
+    """An affine map: [..., inputs] -> [..., features].
+
+    Attributes:
+      features: outputs.
+      use_bias: False where a BatchNorm follows.
+    """
+
+    features: int
+    use_bias: bool = True
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), (x.shape[-1], self.features))
+        y = matmul(x, kernel)
+        if not self.use_bias:
+            return y
+        bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
+        return y + bias.reshape((1,) * (y.ndim - 1) + (-1,))
