@@ -129,13 +129,22 @@ def test_matmul_flops_count_the_runs_of_a_loop():
     assert _flops.matmul_flops(function, jnp.ones((2, 5)), jnp.ones((5, 5))) == 3 * 2 * 2 * 5 * 5
 
 
+def test_matmul_flops_count_one_branch_of_a_condition():
+    def function(x, matrix):
+        return jax.lax.cond(x.sum() > 0, lambda: x, lambda: x @ matrix @ matrix)
+
+    assert _flops.matmul_flops(function, jnp.ones((2, 5)), jnp.ones((5, 5))) == 2 * 2 * 2 * 5 * 5
+
+
 def test_matmul_flops_count_batched_and_backward_products():
     def loss(x, y):
         return jnp.sum(jax.vmap(jnp.dot)(x, y))
 
     forward = 7 * 2 * 2 * 3 * 4
     assert _flops.matmul_flops(loss, jnp.ones((7, 2, 3)), jnp.ones((7, 3, 4))) == forward
-    assert _flops.matmul_flops(jax.grad(loss, argnums=(0, 1)), jnp.ones((7, 2, 3)), jnp.ones((7, 3, 4))) == 3 * forward
+    assert (
+        _flops.matmul_flops(jax.value_and_grad(loss, argnums=(0, 1)), jnp.ones((7, 2, 3)), jnp.ones((7, 3, 4))) == 3 * forward
+    )
 
 
 def test_time_loop_keeps_the_callers_carry():

@@ -284,8 +284,9 @@ def test_diversity_sees_a_collapse_of_one_modality():
 
 @pytest.fixture
 def smooth(monkeypatch):
-    """No network has a kink: batched products round otherwise, and a ReLU at its kink makes another gradient of that (of 20 seeds,
-    one came to differ by 4e-3 within 90 updates).
+    """No network has a kink: batched products round otherwise, and a ReLU at its kink makes another gradient of that.
+
+    Of 20 seeds, one came to differ by 4e-3 within 90 updates.
     """
     monkeypatch.setattr(nn, "relu", nn.silu)
     monkeypatch.setitem(globals(), "program", functools.cache(program.__wrapped__))

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 from jax.extend.core import Jaxpr, jaxprs_in_params
+from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import Array, Float
 
 from experiments.benchmarks._measure import Timing, time_loop
@@ -19,13 +20,18 @@ Shape: TypeAlias = tuple[int, int, int]
 
 
 def matmuls(function: Callable[..., Any], *args: Any) -> Counter[Shape]:
-    """How often one call of a function multiplies matrices of which shape."""
-    return _count(jax.make_jaxpr(function)(*args).jaxpr)
+    """How often one call of a function multiplies matrices of which shape.
+
+    What nothing uses is not computed, and does not count; of a condition's branches the costliest one does.
+    """
+    jaxpr = jax.make_jaxpr(function)(*args).jaxpr
+    used, _ = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+    return _count(used)
 
 
 def matmul_flops(function: Callable[..., Any], *args: Any) -> int:
     """Operations of every matmul in one call of a function, a multiply-add counted as two."""
-    return sum(2 * prod(shape) * count for shape, count in matmuls(function, *args).items())
+    return _flops(matmuls(function, *args))
 
 
 def compiled_flops(function: Callable[..., Any], *args: Any) -> float:
@@ -64,6 +70,11 @@ def _count(jaxpr: Jaxpr) -> Counter[Shape]:
             rows = prod(left.shape) // (copies * inner)
             total[rows, inner, prod(out.shape) // (copies * rows)] += copies
         runs = equation.params["length"] if equation.primitive.name == "scan" else 1
-        for sub in jaxprs_in_params(equation.params):
-            total.update({shape: runs * count for shape, count in _count(sub).items()})
+        subs = [_count(sub) for sub in jaxprs_in_params(equation.params)]
+        for sub in [max(subs, key=_flops)] if equation.primitive.name == "cond" else subs:
+            total.update({shape: runs * count for shape, count in sub.items()})
     return total
+
+
+def _flops(counts: Counter[Shape]) -> int:
+    return sum(2 * prod(shape) * count for shape, count in counts.items())
