@@ -20,7 +20,9 @@ _VECTOR = 16
 def matmul(x: Float[Array, "*batch inputs"], w: Float[Array, "inputs outputs"]) -> Float[Array, "*batch outputs"]:
     """`x @ w` for any leading batch axes, differentiable once, in reverse."""
     *batch, inputs = x.shape
-    return _product(x.reshape(prod(batch), inputs), w).reshape(*batch, w.shape[1])
+    rows = x.reshape(prod(batch), inputs)
+    y = rows @ w if inputs % _VECTOR else _product(rows, w)
+    return y.reshape(*batch, w.shape[1])
 
 
 @jax.custom_vjp
@@ -49,8 +51,6 @@ def _transposed(x: Float[Array, "n inputs"], g: Float[Array, "n outputs"]) -> Fl
 def _transposed_first(x: Float[Array, "n inputs"], g: Float[Array, "n outputs"]) -> Float[Array, "inputs outputs"]:
     """x^T g with a copy of x^T, or as (g^T x)^T with copies of both transposed if these are smaller."""
     (n, inputs), outputs = x.shape, g.shape[1]
-    if inputs % _VECTOR:
-        return x.T @ g
     if n * inputs <= (n + inputs) * outputs:
         return _copy(x.T) @ g
     return _copy(_copy(_copy(g).T) @ x).T
