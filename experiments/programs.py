@@ -12,8 +12,9 @@ import pickle
 import platform
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -64,22 +65,34 @@ class Programs:
         Args:
           name: tells apart functions that are made of the same and have the same arguments.
         """
-        wrapped = cast(jax.stages.Wrapped, function)
+        return self.compile_all({name: function}, *args)[name]
+
+    def compile_all(self, functions: Mapping[str, Callable[..., Any]], *args: Any) -> dict[str, Callable[..., Any]]:
+        """What each of several functions of the same arguments is, by name: one is traced while another is compiled."""
+        files = {name: self._file(name, args) for name in functions}
+        programs: dict[str, Callable[..., Any]] = {}
+        programs |= {name: kept for name, file in files.items() if file and (kept := _load(file)) is not None}
+        missing = [name for name in functions if name not in programs]
+        self.loaded += len(programs)
+        self.compiled += len(missing)
+
+        with _without_cache() if self._folder and missing else nullcontext(), ThreadPoolExecutor() as pool:
+            lowered = (cast(jax.stages.Wrapped, functions[name]).lower(*args) for name in missing)
+            compiling = [pool.submit(one.compile) for one in lowered]
+            programs |= {name: one.result() for name, one in zip(missing, compiling, strict=True)}
+        for name in missing:
+            # Lanes that take turns are compiled to something of their own.
+            if (file := files[name]) and isinstance(program := programs[name], jax.stages.Compiled):
+                _save(file, program)
+        return programs
+
+    def _file(self, name: str, args: Sequence[Any]) -> Path | None:
+        """Where a program is kept."""
         if self._folder is None:
-            self.compiled += 1
-            return wrapped.lower(*args).compile()
+            return None
         leaves, structure = jax.tree.flatten(args)
         key = repr((self._made_of, name, str(structure), [_type(leaf) for leaf in leaves]))
-        file = self._folder / f"{name}-{sha256(key.encode()).hexdigest()}"
-        if (kept := _load(file)) is not None:
-            self.loaded += 1
-            return kept
-        self.compiled += 1
-        with _without_cache():
-            compiled = wrapped.lower(*args).compile()
-        if isinstance(compiled, jax.stages.Compiled):  # lanes that take turns are compiled to something of their own
-            _save(file, compiled)
-        return compiled
+        return self._folder / f"{name}-{sha256(key.encode()).hexdigest()}"
 
 
 def digest(folders: Sequence[Path]) -> str:

@@ -86,9 +86,9 @@ class Runner:
         """Compiles what is still to run ahead of time; returns the seconds that took."""
         began = time.monotonic()
         args = (self._states, self._clock, self._hparams)
-        if not self.env_steps:
-            self._warmup = self.programs.compile("warmup", self._program.warmup, *args)
-        self._chunk = self.programs.compile("chunk", self._program.chunk, *args)
+        warmup = {} if self.env_steps else {"warmup": self._program.warmup}
+        compiled = self.programs.compile_all({**warmup, "chunk": self._program.chunk}, *args)
+        self._chunk, self._warmup = compiled["chunk"], compiled.get("warmup", self._warmup)
         return time.monotonic() - began
 
     def warmup(self) -> None:

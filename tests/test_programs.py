@@ -62,6 +62,27 @@ def test_a_second_start_traces_nothing_and_computes_the_same(tmp_path):
         np.testing.assert_array_equal(one, other)
 
 
+def test_several_are_compiled_and_found_together(tmp_path):
+    Programs(tmp_path).compile("double", Doubling().jitted, state())
+    functions = {"double": Doubling(), "half": Doubling()}
+    for counts in ((1, 1), (2, 0)):
+        own = Programs(tmp_path)
+        programs = own.compile_all({name: function.jitted for name, function in functions.items()}, state())
+        assert (own.loaded, own.compiled) == counts
+        assert list(functions) == sorted(programs)
+        np.testing.assert_array_equal([program(state())["x"] for program in programs.values()], [[2, 2, 2]] * 2)
+    assert [function.traced for function in functions.values()] == [0, 1]
+
+
+def test_one_that_cannot_be_compiled_says_why(tmp_path):
+    def wrong(state):
+        raise ValueError("no such state")
+
+    with pytest.raises(ValueError, match="no such state"):
+        Programs(tmp_path).compile_all({"double": Doubling().jitted, "wrong": jax.jit(wrong)}, state())
+    assert jax.config.values["jax_enable_compilation_cache"]
+
+
 def test_on_one_device_it_does_not_matter_how_an_array_is_said_to_be_split(tmp_path):
     Programs(tmp_path).compile("double", Doubling().jitted, state())
     again = state()
