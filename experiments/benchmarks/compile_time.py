@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import tyro
@@ -53,16 +53,14 @@ class Start:
     Attributes:
       imports: from the request for a process to the benchmark's first line in it.
       init: to trace, lower and compile `Program.init`, or to load what was kept of it.
-      warmup: the same for `Program.warmup`.
-      chunk: the same for `Program.chunk`.
+      training: the same for `Program.warmup` and `Program.chunk`, side by side.
       first_chunk: from the request for a process to the end of the first chunk, the steps before any update included.
       peak_memory: largest resident size of the process, in bytes.
     """
 
     imports: float
     init: float
-    warmup: float
-    chunk: float
+    training: float
     first_chunk: float
     peak_memory: int
 
@@ -92,8 +90,7 @@ def main() -> int:
     columns: dict[str, Callable[[Start], float]] = {
         "process and imports, s": lambda s: s.imports,
         "init, s": lambda s: s.init,
-        "warmup, s": lambda s: s.warmup,
-        "chunk, s": lambda s: s.chunk,
+        "warmup and chunk, s": lambda s: s.training,
         "first chunk done after, s": lambda s: s.first_chunk,
         "peak memory, MiB": lambda s: s.peak_memory / 2**20,
     }
@@ -132,22 +129,20 @@ def start(cache: Path, args: Args, *, requested: float) -> Start:
     targets, hparams = stack_targets([target] * args.seeds), stack_hparams([one] * args.seeds)
     programs = Programs.of(args)
 
-    def compile_ahead(name: str, function: Callable[..., Any], *args: Any) -> tuple[Callable[..., Any], float]:
-        began = time.perf_counter()
-        return programs.compile(name, function, *args), time.perf_counter() - began
-
-    keys = jax.random.split(jax.random.key(0), args.seeds)
-    init, init_seconds = compile_ahead("init", program.init, keys, targets, hparams)
-    states, clock = init(keys, targets, hparams), Clock.start()
-    warmup, warmup_seconds = compile_ahead("warmup", program.warmup, states, clock, hparams)
-    states, clock = warmup(states, clock, hparams)
-    chunk, chunk_seconds = compile_ahead("chunk", program.chunk, states, clock, hparams)
-    jax.block_until_ready(chunk(states, clock, hparams))
+    lanes = jax.random.split(jax.random.key(0), args.seeds), targets, hparams
+    began = time.perf_counter()
+    init = programs.compile("init", program.init, *lanes)
+    init_seconds = time.perf_counter() - began
+    training = init(*lanes), Clock.start(), hparams
+    began = time.perf_counter()
+    compiled = programs.compile_all({"warmup": program.warmup, "chunk": program.chunk}, *training)
+    training_seconds = time.perf_counter() - began
+    states, clock = compiled["warmup"](*training)
+    jax.block_until_ready(compiled["chunk"](states, clock, hparams))
     return Start(
         imports=imports,
         init=init_seconds,
-        warmup=warmup_seconds,
-        chunk=chunk_seconds,
+        training=training_seconds,
         first_chunk=time.time() - requested,
         peak_memory=_measure.peak_memory(),
     )
