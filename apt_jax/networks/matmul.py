@@ -1,4 +1,4 @@
-"""A matmul whose weights' gradient takes no longer than its output on CPU.
+"""A matmul whose weights' gradient is not slowed down by a transposed operand on CPU.
 
 There XLA has fast kernels for products of rows by columns, and slow ones where the left factor has to be transposed, as in the
 weights' gradient x^T g: up to four times the time, for what the networks here multiply (experiments/NOTES.md, section 31).
