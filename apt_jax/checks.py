@@ -94,6 +94,7 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
         not learns or (config.model_batch_size >= 2 and config.model_batch_size % sources == 0),
         f"model_batch_size must be at least 2 and a multiple of the {sources} sources, got {config.model_batch_size}",
     )
+    require(math.isfinite(config.blank_bias), f"blank_bias must be finite, got {config.blank_bias}")
     require(
         config.recent_steps >= longest,
         f"recent_steps must hold one horizon of every environment: at least {longest}, got {config.recent_steps}",

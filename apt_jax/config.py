@@ -30,12 +30,12 @@ class HParams:
       target_rate: Polyak rate of the target network (not of the target task) per policy update, in [0, 1] (the paper
         names none).
       reset_every: environment steps between resets of the Q-network, replay kept, for as long as the kept policy's return on
-        the target is not above 0, > 0 (the paper has none: infinite).
+        the target is not above 0, > 0 (the paper has none: `inf`).
       epsilon_start: exploration right after warm-up, in [0, 1].
       epsilon_end: exploration in the long run, in [0, 1].
       epsilon_steps: environment steps over which epsilon falls linearly, > 0.
       delta: wanted return of generated tasks (paper: 0.5).
-      tolerance: band around `delta` in which beta stays (paper: 0.1).
+      tolerance: half the width of the band around `delta` in which beta stays (paper: 0.1).
       beta_init: beta at the start.
       beta_min: lower bound of beta (paper: 1/8).
       beta_max: upper bound of beta (paper: 8).

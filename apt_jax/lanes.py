@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import chain, islice, zip_longest
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,8 @@ class Program(NamedTuple):
     Attributes:
       init: `init(keys, targets, hparams) -> states`, for keys [L], and targets and hparams with leaves [L, ...]; of several
         devices none may be committed to one.
-      warmup: `warmup(states, clock, hparams) -> (states, clock)`.
+      warmup: `warmup(states, clock, hparams) -> (states, clock)`, from `Clock.start()`, once before any chunk: there is nothing
+        to learn from without it.
       chunk: `chunk(states, clock, hparams) -> (states, clock, metrics)`.
     """
 
@@ -90,11 +91,16 @@ def make_program(
 
     Raises:
       ValueError: fewer than one lane, or fewer lanes than processes, or several processes with more lanes than there is room
-        for, or no CPU among JAX's platforms where lanes take turns.
+        for, or no CPU among JAX's platforms where lanes take turns; no devices, or an unknown layout.
     """
     if lanes < 1:
         raise ValueError(f"a program needs at least one lane, got {lanes}")
-    used = _spread(devices or jax.devices(), lanes)
+    if layout not in get_args(Layout):
+        raise ValueError(f"layout must be one of {', '.join(get_args(Layout))}, got {layout!r}")
+    devices = jax.devices() if devices is None else devices
+    if not devices:
+        raise ValueError("a program needs at least one device")
+    used = _spread(devices, lanes)
     if resident is not None and lanes > resident * len(used):
         group = resident * len(used)
         if len({device.process_index for device in used}) > 1:

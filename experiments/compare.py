@@ -30,11 +30,13 @@ OWN = ("run-dir", "resume", "method", "target", "config.method")
 
 @dataclass(frozen=True)
 class Compare:
-    """Compare methods on targets; all other options are those of experiments.train.
+    """Compare methods on targets.
+
+    All other options, such as --seeds, --env-steps, --preset and --devices, are those of `python -m experiments.train --help`.
 
     Attributes:
       out: where the runs, `comparison.md` and `comparison.png` go.
-      methods: what to compare, by default every method of the paper; with a bonus added as in "apt_gen+rnd".
+      methods: what to compare, by default all ten methods; with a bonus added as in "apt_gen+rnd".
       targets: names of targets, or files that describe them.
       seeds_per_job: split the seeds of a method and target into runs of so many, OUT/TARGET/METHOD/seeds_...; by default they
         are lanes of one.

@@ -51,7 +51,7 @@ class Args:
     Attributes:
       run_dir: a run of APT-Gen.
       periods: evaluation periods to go on for.
-      tasks: that the frozen policies play in each.
+      tasks: that the frozen policies play per period.
       seed: random seed of those tasks and of the policies' exploration.
     """
 

@@ -41,11 +41,11 @@ class Interrupt:
         """`work()` in a thread, because Python handles signals only while its main thread is not inside XLA.
 
         Args:
-          on_request: called once if a request comes meanwhile; the work goes on.
+          on_request: called once if a request comes meanwhile, or came just before; the work goes on.
         """
         with ThreadPoolExecutor(max_workers=1) as pool:
             future = pool.submit(work)
-            told = self.requested
+            told = False
             while wait([future], timeout=_POLL_SECONDS).not_done:
                 if self.requested and not told:
                     on_request()

@@ -57,8 +57,13 @@ def learning_curves(file: Path, settings: Mapping[str, Run], *, delta: float | N
     curves = next(iter(settings.values()))[1]
     named = len(curves["seed"]) <= NAMED
     names = [name for name in PANELS if name in curves]
-    figure = Figure(figsize=(4.2 * len(names), 3.6), layout="constrained")
-    for axes, name in zip(np.atleast_1d(figure.subplots(1, len(names))), names, strict=True):
+    across = min(3, len(names))
+    down = -(-len(names) // across)
+    figure = Figure(figsize=(4.2 * across, 3.2 * down + 0.6), layout="constrained")
+    grid = list(figure.subplots(down, across, squeeze=False).flat)
+    for axes in grid[len(names) :]:
+        axes.set_visible(False)
+    for axes, name in zip(grid, names, strict=False):
         for index, (setting, (env_steps, curves)) in enumerate(settings.items()):
             for seed, values in zip(curves["seed"][:, 0], curves[name], strict=True):
                 style: dict[str, Any] = {"label": f"seed {seed:.10g}" if named else None} if single else {"color": f"C{index}"}
@@ -103,6 +108,7 @@ def _together(blocks: Sequence[Block], names: Sequence[str]) -> Figure:
             handles[name] = _seeds_and_mean(axes, run, metric, f"C{names.index(name)}")
         _decorate(axes, metric)
         if title:
+            axes.set_ylabel(axes.get_title())
             axes.set_title(title, fontsize="medium")
     _legend(figure, list(handles.values()), list(handles))
     return figure
@@ -167,7 +173,9 @@ def _decorate(axes: Axes, name: str) -> None:
 
 def _mark(axes: Axes, level: float, text: str) -> None:
     axes.axhline(level, color=_TARGET_COLOUR, linestyle="--", linewidth=1)
-    axes.annotate(text, (0.99, level), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize="small")
+    box = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+    at = (0.01, level)
+    axes.annotate(text, at, xycoords=("axes fraction", "data"), va="bottom", fontsize="small", color=_TARGET_COLOUR, bbox=box)
 
 
 def progression(file: Path, boards: Mapping[int, Sequence[Image]], target: Image, *, rows: Sequence[str]) -> None:

@@ -28,13 +28,19 @@ class Problem(NamedTuple):
 
 
 def load_target(space: str, name: str, file: Path | None) -> Any:
-    """The target task of a file, if one is given, else of a name; raises a `UsageError` if there is none."""
+    """The target task of a file, if one is given, else of a name; raises a `UsageError` if there is none, or no solution."""
     if not file and Path(name).suffix:
         raise UsageError(f"--target {name} is no file")
     try:
-        return envs.load_target_file(space, file) if file else envs.load_target(space, name)
+        if not file:
+            return envs.load_target(space, name)
+        target = envs.load_target_file(space, file)
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from error
+    own = make_space(space)
+    if not jax.jit(own.describe)(target, target).get("feasible", True):
+        raise UsageError(f"{file}: no {own.horizon} steps, an episode's longest, solve this task")
+    return target
 
 
 def import_plugins(names: Iterable[str]) -> None:

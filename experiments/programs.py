@@ -7,6 +7,7 @@ of its arguments.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import pickle
 import platform
@@ -28,6 +29,7 @@ from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 import apt_jax
 import envs
+from apt_jax.turns import Turns
 from experiments import runtime
 
 SOURCES = tuple(Path(package.__path__[0]) for package in (apt_jax, envs))
@@ -71,7 +73,7 @@ class Programs:
         """What each of several functions of the same arguments is, by name: one is traced while another is compiled."""
         files = {name: self._file(name, args) for name in functions}
         programs: dict[str, Callable[..., Any]] = {}
-        programs |= {name: kept for name, file in files.items() if file and (kept := _load(file)) is not None}
+        programs |= {name: kept for name, file in files.items() if file and (kept := _load(file, functions[name])) is not None}
         missing = [name for name in functions if name not in programs]
         self.loaded += len(programs)
         self.compiled += len(missing)
@@ -81,9 +83,8 @@ class Programs:
             compiling = [pool.submit(one.compile) for one in lowered]
             programs |= {name: one.result() for name, one in zip(missing, compiling, strict=True)}
         for name in missing:
-            # Lanes that take turns are compiled to something of their own.
-            if (file := files[name]) and isinstance(program := programs[name], jax.stages.Compiled):
-                _save(file, program)
+            if file := files[name]:
+                _save(file, programs[name])
         return programs
 
     def _file(self, name: str, args: Sequence[Any]) -> Path | None:
@@ -105,13 +106,14 @@ def digest(folders: Sequence[Path]) -> str:
 
 
 def machine() -> tuple[object, ...]:
-    """What a program that runs here need not run on elsewhere, or not as well."""
+    """What a program that runs here need not run on elsewhere, or not as well, with all devices that it should use."""
     info = Path("/proc/cpuinfo")
     cpu = info.read_text().split("\n\n")[0] if info.is_file() else platform.processor()
     features = [line for line in cpu.splitlines() if line.startswith(("model name", "flags", "Features"))]
-    device = jax.devices()[0]
-    versions = (device.device_kind, device.client.platform_version)
-    return platform.machine(), features or cpu, runtime.cores(), versions, runtime.device_memory()
+    devices = jax.devices()
+    versions = (devices[0].device_kind, devices[0].client.platform_version)
+    numbers = [device.id for device in devices]
+    return platform.machine(), features or cpu, runtime.cores(), versions, numbers, runtime.device_memory()
 
 
 def _type(leaf: Any) -> tuple[object, ...]:
@@ -141,8 +143,9 @@ def _without_cache() -> Iterator[None]:
         reset_cache()
 
 
-def _save(file: Path, compiled: jax.stages.Compiled) -> None:
-    """Whole or not at all, whoever else writes it; a run goes on without."""
+def _save(file: Path, program: Callable[..., Any]) -> None:
+    """Whole or not at all, whoever else writes it; a run goes on without.  Of lanes that take turns, what each turn calls."""
+    compiled = cast(jax.stages.Compiled, program.function if isinstance(program, Turns) else program)
     own = file.with_name(f"{file.name}.{os.getpid()}")
     try:
         ids = _ids(jax.tree.leaves(compiled.output_shardings)[0])
@@ -166,13 +169,14 @@ def _look_up_lapack() -> None:
     jax.jit(jnp.linalg.cholesky).trace(square).lower(lowering_platforms=("cpu",))
 
 
-def _load(file: Path) -> jax.stages.Compiled | None:
-    """None if there is none, or none that can be used."""
+def _load(file: Path, function: Callable[..., Any]) -> Callable[..., Any] | None:
+    """What `function` was compiled to; None if there is none, or none that can be used."""
     try:
         (serialized, in_tree, out_tree), ids = pickle.loads(zlib.decompress(file.read_bytes()))
         devices = [device for device in jax.devices() if device.id in ids]
         _look_up_lapack()
-        return serialize_executable.deserialize_and_load(serialized, in_tree, out_tree, execution_devices=devices)
+        compiled = serialize_executable.deserialize_and_load(serialized, in_tree, out_tree, execution_devices=devices)
+        return dataclasses.replace(function, function=compiled) if isinstance(function, Turns) else compiled
     except OSError:
         return None
     except Exception as error:  # whatever a damaged file makes of itself

@@ -60,8 +60,8 @@ class RunDir:
 
     @property
     def has_results(self) -> bool:
-        """Whether the run came to an end, or was stopped; one that was killed has no summary."""
-        return (self.path / "summary.json").is_file()
+        """Whether anything was learned; a checkpoint comes before the first row."""
+        return bool(_read_rows(self.path))
 
     def rewind(self, env_steps: int) -> None:
         """Drops what was written after a checkpoint's step, so that a resumed run writes it once."""

@@ -43,7 +43,7 @@ class Args:
 
     Attributes:
       run_dir: a run of APT-Gen on Grid-World.
-      tasks: per rung.
+      tasks: played per rung.
       seed: random seed of the choice of tasks and of the policy's exploration.
       figure: where to draw the curves, if anywhere.
     """

@@ -119,10 +119,11 @@ class Runner:
 
     def restore(self, directory: Path) -> None:
         """Goes on from a checkpoint, also one from other devices or of another number of processes."""
-        states, self._clock = load_states(directory, self._trainer, self._keys, self._hparams, self._mesh)
-        if states.key.shape[0] != self._rows:
-            lanes = _padded(self._lanes, self._rows)
-            shardings = jax.tree.map(lambda x: x.sharding, self._states)
+        rows, mesh, shardings = self._rows, self._mesh, jax.tree.map(lambda x: x.sharding, self._states)
+        del self._states  # its place is needed
+        states, self._clock = load_states(directory, self._trainer, self._keys, self._hparams, mesh)
+        if states.key.shape[0] != rows:
+            lanes = _padded(self._lanes, rows)
             states = jax.jit(lambda tree: jax.tree.map(lambda x: x[lanes], tree), out_shardings=shardings)(states)
         self._states = states
         self.env_steps = int(self._clock.env_steps)

@@ -56,13 +56,20 @@ def describe() -> dict[str, object]:
 
 
 def git_commit() -> str | None:
-    """The commit that runs, with "-dirty" where the code differs from it; texts and results make no difference."""
+    """The commit that runs, with "-dirty" where the code differs from it; texts and results make no difference.
+
+    None if git does not know this file, as where the project is installed below another one's checkout.
+    """
     git = ["git", "-C", str(Path(__file__).parent.parent)]
     code = [".", ":(exclude)*.md", ":(exclude)experiments/results"]
     try:
-        commit, changes = (
+        _, commit, changes = (
             subprocess.run([*git, *words], capture_output=True, text=True, check=True).stdout.strip()
-            for words in (("rev-parse", "HEAD"), ("status", "--porcelain", "--", *code))
+            for words in (
+                ("ls-files", "--error-unmatch", __file__),
+                ("rev-parse", "HEAD"),
+                ("status", "--porcelain", "--", *code),
+            )
         )
     except (OSError, subprocess.CalledProcessError):  # no git, or not a checkout
         return None

@@ -16,6 +16,7 @@ import tyro
 import envs
 from apt_jax.config import PRESETS, Config, HParams, check_hparams
 from apt_jax.lanes import Layout
+from apt_jax.registry import look_up
 from experiments import lanes, run_dir
 from experiments.errors import UsageError
 
@@ -58,8 +59,9 @@ class Experiment:
       space: the task space: grid_world, manipulation, or manipulation_sawyer.
       target: the target task's name in the space, or a file that describes it.
       target_file: the file that `target` is, if it is one; of a run, what the run directory has kept of it.
-      seeds: one lane of the compiled program each, for every combination of swept hyper-parameters.
-      env_steps: environment steps of all sources together, warm-up included.
+      seeds: random seeds, trained side by side; each runs every combination of swept hyper-parameters.
+      env_steps: environment steps of each seed, of all sources together, warm-up included: `warmup_steps` and a multiple of
+        `eval_every`.
       plugins: Python modules to import first, which may add methods of their own to those that come with apt_jax.
       config: sizes and names; a change compiles a new program.
       hparams: numbers; a field may hold a tuple of values, all of which are run.
@@ -98,7 +100,7 @@ class Session:
       coordinator_address: host and port at which the first process can be reached.
       num_processes: how many processes there are.
       process_id: which one this is, from 0.
-      sinks: also log there.
+      sinks: also log to these: tensorboard (in the run directory), wandb (project apt-jax).
       checkpoint_every: environment steps between checkpoints.
     """
 
@@ -195,8 +197,11 @@ def starting_point(preset: Preset, space: str, method: str) -> tuple[Config, HPa
 
     Returns:
       The preset's `Config` with that method, and the hyper-parameters, a number each.
+
+    Raises:
+      ValueError: an unknown preset.
     """
-    config, hparams = PRESETS[preset]
+    config, hparams = look_up(PRESETS, preset, "preset")
     own = {"gamma": GAMMA[space]} if space in GAMMA else {}
     tuned = TUNED.get((space, method), {}) if preset == "fast" else {}
     return dataclasses.replace(config, method=method), dataclasses.replace(hparams, **{**own, **tuned})

@@ -41,7 +41,7 @@ class Signs:
 
     Attributes:
       runs: directories of runs of apt_gen or its ablations; a run is called by its directory's name.
-      after: columns with a single number are means over the evaluations after so many environment steps.
+      after: means are over the evaluations after so many environment steps.
     """
 
     runs: tuple[Path, ...]

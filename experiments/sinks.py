@@ -28,6 +28,10 @@ class Sink(Protocol):
         ...
 
 
+_GROUP_LENGTH = 128
+"""Characters that W&B allows."""
+
+
 class TensorBoard:
     """Event files in the run directory."""
 
@@ -48,13 +52,14 @@ class TensorBoard:
 
 
 class WeightsAndBiases:
-    """One W&B run per session, sessions of one run directory in one group."""
+    """One W&B run per session; sessions of one run directory, by its path, are one group."""
 
     def __init__(self, run_dir: Path, start: int, lanes: Sequence[Lane], config: Mapping[str, Any]):
         import wandb
 
         self._lanes = lanes
-        self._run = wandb.init(project="apt-jax", group=run_dir.name, dir=run_dir, config=dict(config))
+        group = run_dir.resolve().as_posix()[-_GROUP_LENGTH:]
+        self._run = wandb.init(project="apt-jax", group=group, dir=run_dir, config=dict(config))
 
     def write(self, env_steps: int, metrics: Metrics) -> None:
         """One scalar per metric and lane."""

@@ -1,4 +1,4 @@
-"""Training runs on the corridor: `python -m tests.corridor_runs ...` is `experiments.train ...` with that space."""
+"""Training runs on the corridor without pictures: `python -m tests.corridor_runs ...` is `experiments.train ...`."""
 
 from __future__ import annotations
 
@@ -6,14 +6,11 @@ import os
 import shlex
 import signal
 import sys
-from typing import ClassVar
-
-import numpy as np
 
 import envs
 from experiments import compare, pictures, train
+from experiments.examples.corridor import Corridor
 from experiments.run_dir import RunDir
-from tests.corridor import Corridor
 
 OPTIONS = shlex.split(
     """--space corridor --preset paper --seeds 3 0 5 1 2 4 6 7 8 --env-steps 440 --config.warmup-steps 40 --config.eval-every 20
@@ -23,18 +20,9 @@ OPTIONS = shlex.split(
 )
 
 
-class Space(Corridor):
-    """With what the scripts want of a space beyond training."""
-
-    targets: ClassVar = {"far": "7"}
-
-    def parse_target(self, text):
-        return np.int32(text)
-
-
 def register():
-    """Makes the space known by name, and leaves out the pictures, which cost more than such a run."""
-    envs.SPACES["corridor"] = Space
+    """Makes the space known by its name, and leaves out the pictures, which cost more than such a run."""
+    envs.SPACES["corridor"] = Corridor
     pictures.draw = lambda *_: None
 
 

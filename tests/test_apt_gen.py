@@ -19,7 +19,7 @@ from apt_jax.curricula import apt_gen_objectives as objectives
 from apt_jax.descent import ADAM
 from apt_jax.networks.generator import OUTPUT_NORM
 from apt_jax.specs import Grid, Table
-from tests.corridor import Corridor
+from experiments.examples.corridor import Corridor
 from tests.test_trainer import CONFIG, run
 
 SPACE = Corridor()

@@ -36,7 +36,7 @@ from experiments.benchmarks import (
 )
 from experiments.benchmarks._grid_worlds import JaxWorld, restart
 from experiments.benchmarks._stretched import Stretched
-from tests.corridor import Corridor
+from experiments.examples.corridor import Corridor
 
 CONFIG = Config(
     method="random",  # half the compilation of apt_gen; the pieces of its model update are timed all the same

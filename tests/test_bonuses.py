@@ -18,7 +18,7 @@ from apt_jax.lanes import make_program, stack_hparams
 from apt_jax.networks import Dynamics
 from apt_jax.replay import ReturnRange
 from apt_jax.trainer import Clock, make_trainer
-from tests.corridor import Corridor
+from experiments.examples.corridor import Corridor
 from tests.lock import Lock
 
 CONFIG = Config(model_batch_size=32)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from apt_jax.config import Config, HParams
 from apt_jax.lanes import make_program, stack_hparams, stack_targets
 from apt_jax.specs import Vector
 from apt_jax.trainer import Clock, make_trainer
-from tests.corridor import LENGTH, Corridor
+from experiments.examples.corridor import LENGTH, Corridor
 
 COLUMNS = 1_000_003
 """A prime: an array whose size it divides is a ring of transitions, or a copy of one."""
@@ -52,10 +52,13 @@ CALLS = {"while", "fusion", "call", "conditional"}
 HOST = {"infeed", "outfeed", "send", "recv"}
 
 
+PAIR = {"place": Vector(2, -LENGTH, LENGTH, "int8")}
+
+
 class PairedCorridor(Corridor):
     """Observes two numbers at once: the CPU's compiler copies an array with an axis of size 1, though only outside the loop."""
 
-    obs_spec: ClassVar = {"place": Vector(2, -LENGTH, LENGTH, "int8")}
+    obs_spec = PAIR
 
     def _observe(self, position, goal):
         return {"place": jnp.stack([position, goal - position]).astype(jnp.int8)}

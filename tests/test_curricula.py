@@ -19,7 +19,7 @@ from apt_jax.config import Config, HParams
 from apt_jax.curricula import CURRICULA, alp_gmm, goal_gan
 from apt_jax.curricula.base import GENERATED
 from apt_jax.specs import Grid, Table, Vector, block_weights, flatten, unflatten
-from tests.corridor import Corridor
+from experiments.examples.corridor import Corridor
 
 SPEC = {"tiles": Grid(2, 2, 3), "xy": Vector(2, 0, 10), "place": Table(2, 4)}
 

@@ -14,7 +14,7 @@ from apt_jax.replay import Episode
 from apt_jax.trainer import Clock, make_trainer
 from experiments import foresight, settings, train
 from experiments.errors import UsageError
-from tests.corridor import Corridor
+from experiments.examples.corridor import Corridor
 
 
 def test_episodes_count_if_any_length_would_have_fitted():

@@ -17,8 +17,8 @@ from apt_jax.methods import METHODS
 from envs.grid_world.placement import parameter, place
 from envs.grid_world.solver import solve
 from experiments import ladder, settings, train
+from experiments.examples.corridor import Corridor
 from experiments.problem import make_problem
-from tests.corridor import Corridor
 
 SPACE = envs.make("grid_world")
 PLUGIN = "experiments.ladder_methods"

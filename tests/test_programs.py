@@ -16,11 +16,12 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import envs
 from apt_jax.config import Config
+from apt_jax.turns import Turns
 from experiments import programs
+from experiments.examples.corridor import Corridor
 from experiments.programs import Programs
 from experiments.settings import Experiment, Session
 from experiments.train import kept_programs
-from tests.corridor import Corridor
 
 ROOT = Path(__file__).parents[1]
 
@@ -111,6 +112,30 @@ def test_what_differs_in_anything_is_another_program(tmp_path, name, made_of, ar
         result = own.compile(name, Doubling().jitted, state(**argument))(state(**argument))["x"]
         assert own.loaded == loaded
         assert (result.shape, result.dtype, result.sharding) == (expected.shape, expected.dtype, expected.sharding)
+
+
+def test_lanes_that_take_turns_are_kept_too(tmp_path):
+    mesh = Mesh(np.array(jax.devices()[:1]), ("lane",))
+    lanes = np.arange(3, dtype=np.float32)
+    traced = []
+
+    def double(lanes):
+        traced.append(lanes.shape)
+        return 2 * lanes
+
+    for loaded in (0, 1):
+        own = Programs(tmp_path)
+        compiled = own.compile("double", Turns(jax.jit(double), 3, 2, mesh), lanes)
+        np.testing.assert_array_equal(compiled(lanes), [0, 2, 4])
+        assert own.loaded == loaded
+    assert traced == [(2,)]
+
+
+def test_a_program_for_some_devices_is_not_found_by_a_start_that_has_more(monkeypatch):
+    before = programs.machine()
+    devices = jax.devices()
+    monkeypatch.setattr(jax, "devices", lambda *_: devices[:1])
+    assert programs.machine() != before
 
 
 def test_a_damaged_file_is_made_anew(tmp_path):

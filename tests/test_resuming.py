@@ -20,6 +20,7 @@ import envs
 from apt_jax import checkpoint
 from experiments import compare, pictures, settings, train
 from experiments.compare import Compare
+from experiments.examples.corridor import Corridor
 from experiments.problem import make_problem
 from experiments.run_dir import RunDir
 from experiments.runner import Runner, lane_inputs, load_states
@@ -114,7 +115,7 @@ def test_two_processes_train_as_one_and_one_goes_on_for_both(tmp_path, start, wh
 
 
 def test_an_interrupt_during_the_last_pictures_stops_what_would_come_next(tmp_path, monkeypatch):
-    monkeypatch.setitem(envs.SPACES, "corridor", corridor_runs.Space)
+    monkeypatch.setitem(envs.SPACES, "corridor", Corridor)
     monkeypatch.setattr(pictures, "draw", lambda *_: os.kill(os.getpid(), signal.SIGINT))
     comparison = Compare(tmp_path, methods=("dqn", "random"), targets=("far",))
     runs = compare.plan(comparison, [*OPTIONS, "--seeds", "0", "--env-steps", "60"])

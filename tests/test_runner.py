@@ -10,10 +10,10 @@ from apt_jax.config import Config
 from apt_jax.lanes import lane_bytes
 from apt_jax.trainer import make_trainer
 from experiments import runtime
+from experiments.examples.corridor import Corridor
 from experiments.programs import Programs
 from experiments.runner import Runner
 from experiments.settings import Experiment
-from tests.corridor import Corridor
 
 
 @pytest.fixture(scope="module")

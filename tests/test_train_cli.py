@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -303,6 +304,29 @@ def test_a_missing_sink_names_its_extra(monkeypatch):
         sinks.check_installed(["wandb"])
 
 
+def test_sessions_of_a_run_are_one_group_in_weights_and_biases(tmp_path, monkeypatch):
+    runs = []
+
+    class Run:
+        def __init__(self, **options):
+            self.group, self.logged, self.finished = options["group"], {}, False
+            runs.append(self)
+
+        def log(self, scalars, step):
+            self.logged[step] = scalars
+
+        def finish(self):
+            self.finished = True
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=Run))
+    for path in (tmp_path / "A" / "dqn", tmp_path / "B" / "dqn", tmp_path / "A" / "dqn"):
+        (sink,) = sinks.make_sinks(["wandb"], path, start=0, lanes=Experiment(seeds=(3,)).lanes, config={})
+        sink.write(100, {"beta": np.float32([1.0])})
+        sink.close()
+    assert runs[0].group == runs[2].group != runs[1].group
+    assert all(run.logged == {100: {"beta/seed_3": 1.0}} and run.finished for run in runs)
+
+
 def test_tensorboard_writes_events(tmp_path):
     (sink,) = sinks.make_sinks(["tensorboard"], tmp_path, start=0, lanes=Experiment(seeds=(0,)).lanes, config={})
     sink.write(100, {"beta": np.float32([1.0])})
@@ -350,6 +374,7 @@ def test_an_interrupted_run_says_how_to_go_on_and_ends_complete(tmp_path, capsys
     kept = (run / "metrics.csv").read_bytes()
     shutil.rmtree(run / "checkpoints")
     assert train.train(*settings.parse(["--run-dir", str(run), "--resume"])) == 0
+    (run / "summary.json").unlink()  # as of a run that was killed
     with pytest.raises(UsageError, match="has results, but no checkpoint to go on from"):
         train.train(*settings.parse(["--run-dir", str(run), "--resume", "--env-steps", "1300"]))
     assert (run / "metrics.csv").read_bytes() == kept

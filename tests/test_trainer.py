@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import ClassVar, NamedTuple
+import math
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -24,7 +25,7 @@ from apt_jax.methods import METHODS, Method, parse_method
 from apt_jax.specs import Vector
 from apt_jax.task_space import task_struct
 from apt_jax.trainer import Clock, make_trainer
-from tests.corridor import Corridor
+from experiments.examples.corridor import Corridor
 
 SPACE = Corridor()
 TARGET = np.int32(7)
@@ -194,6 +195,20 @@ def lane_struct(trainer):
     return jax.eval_shape(make_program(trainer, 1).init, keys, targets(1), lanes), Clock.start(), lanes
 
 
+def test_a_head_start_that_is_no_number_is_refused():
+    for value in (math.nan, math.inf):
+        with pytest.raises(ValueError, match=f"blank_bias must be finite, got {value}"):
+            make_trainer(SPACE, config("apt_gen", blank_bias=value))
+
+
+def test_a_layout_or_devices_that_there_are_not_are_refused():
+    trainer = make_trainer(SPACE, CONFIG)
+    with pytest.raises(ValueError, match="layout must be one of auto, vmap, map, got 'pmap'"):
+        make_program(trainer, 1, layout="pmap")
+    with pytest.raises(ValueError, match="at least one device"):
+        make_program(trainer, 1, devices=[])
+
+
 def test_64_bits_are_refused():
     with jax.enable_x64(True), pytest.raises(ValueError, match="computes with 32 bits: unset jax_enable_x64"):
         make_trainer(SPACE, CONFIG)
@@ -207,9 +222,12 @@ def test_matmuls_are_whole_float32_whatever_the_platforms_default():
     assert text.count("dot_general") == text.count("precision = [HIGHEST, HIGHEST]") > 0
 
 
+WEAK = {"position": Vector(1, 0, 1)}
+
+
 def test_a_space_may_compute_with_weak_dtypes():
     class Weak(Corridor):
-        obs_spec: ClassVar = {"position": Vector(1, 0, 1)}
+        obs_spec = WEAK
 
         def _observe(self, position, goal):
             return {"position": jnp.where(position == goal, 1.0, 0.0)[None]}

@@ -35,17 +35,20 @@ def _forward(x: Float[Array, "n inputs"], w: Float[Array, "inputs outputs"]) -> 
 
 
 def _backward(factors: tuple[Array, Array], g: Float[Array, "n outputs"]) -> tuple[Array, Array]:
-    x, w = factors
-    # Not merged with the sum that follows where an ensemble shares its rows: that takes ten times their products' time.
-    return _copy(g @ w.T), lax.platform_dependent(x, g, cpu=_transposed_first, default=_transposed)
+    gradients: tuple[Array, Array] = lax.platform_dependent(*factors, g, cpu=_with_copies, default=_plain)
+    return gradients
 
 
 _product.defvjp(_forward, _backward)
 
 
-def _transposed(x: Float[Array, "n inputs"], g: Float[Array, "n outputs"]) -> Float[Array, "inputs outputs"]:
-    """x^T g."""
-    return x.T @ g
+def _plain(x: Array, w: Array, g: Array) -> tuple[Array, Array]:
+    return g @ w.T, x.T @ g
+
+
+def _with_copies(x: Array, w: Array, g: Array) -> tuple[Array, Array]:
+    # Not merged with the sum that follows where an ensemble shares its rows: that takes ten times their products' time.
+    return _copy(g @ w.T), _transposed_first(x, g)
 
 
 def _transposed_first(x: Float[Array, "n inputs"], g: Float[Array, "n outputs"]) -> Float[Array, "inputs outputs"]:

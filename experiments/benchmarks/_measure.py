@@ -251,10 +251,11 @@ def _caption(environment: Mapping[str, Any], options: Options, peers: Sequence[s
     packages = {**environment["packages"], **environment["peers"]}
     named = ("jax", "jaxlib", "flax", "optax", "numpy", *peers)
     versions = ", ".join(f"{name} {packages[name]}" for name in named if packages[name])
+    commit, dash, dirty = (environment["git_commit"] or "unknown").partition("-")
     repeats = "Measured once" if options.repeats == 1 else f"Median (range) of {options.repeats} repeats"
     return (
         f"{repeats}; {environment['cpu']}, {environment['cores']} cores, "
-        f"{environment['device_kind']}; {versions}; commit {(environment['git_commit'] or 'unknown')[:12]}; "
+        f"{environment['device_kind']}; {versions}; commit {commit[:12]}{dash}{dirty}; "
         f"{environment['busy']:.0%} of the machine busy before it began."
     )
 
