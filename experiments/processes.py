@@ -9,13 +9,15 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
 from experiments.errors import UsageError
+
+T = TypeVar("T")
 
 _SHUTDOWN_SECONDS = 3600
 """How long the others wait at the end for the first one, which draws the pictures."""
@@ -56,24 +58,26 @@ def any_of(flag: bool) -> bool:
     return bool(gather(np.array([flag])).any())
 
 
-def from_first(work: Callable[[], int]) -> int:
-    """What `work` returns in the first process, where alone it is done; if it fails there, it fails everywhere.
+def together(work: Callable[[], T]) -> T:
+    """What `work` returns in this process; if it fails in one, it fails in all.
 
     Raises:
-      UsageError: in the others, if it fails.
+      UsageError: where it did not fail itself.
     """
-    error, value = None, 0
-    if is_first():
-        try:
-            value = work()
-        except Exception as caught:  # whatever it is, the others must not wait for the result
-            error = caught
-    failed, value = gather(np.array([[error is not None, value]], np.int32))[0].tolist()
-    if error:
-        raise error
-    if failed:
-        raise UsageError("stopped, because the first process did")
+    try:
+        value = work()
+    except Exception:  # whatever it is, the others must not wait for this process
+        any_of(True)
+        raise
+    if any_of(False):
+        raise UsageError("stopped, because another process did")
     return value
+
+
+def from_first(work: Callable[[], int | None]) -> int:
+    """What `work` returns in the first process, where alone it is done, 0 for nothing; raises as `together`."""
+    value = together(lambda: work() if is_first() else None)
+    return int(gather(np.array([value or 0], np.int32))[0])
 
 
 def check_same(what: str) -> None:

@@ -50,8 +50,8 @@ def start_jax(session: Session) -> None:
 
 def train(experiment: Experiment, session: Session) -> int:
     """Trains until `experiment.env_steps` or an interrupt; returns the exit code."""
-    problem = make_problem(experiment)
-    check_installed(session.sinks)
+    problem = processes.together(lambda: make_problem(experiment))
+    processes.from_first(lambda: check_installed(session.sinks))
     processes.check_same(repr((experiment, dataclasses.replace(session, process_id=None))))
     programs = kept_programs(experiment, session, problem.space)
     runner = Runner(problem.trainer, problem.target, experiment, session.layout, programs)
@@ -170,9 +170,8 @@ class Training:
         return self.runner.env_steps % every < self.experiment.config.eval_every
 
     def _record(self, metrics: Metrics) -> None:
-        if processes.is_first():
-            index = [lane.index for lane in self.experiment.lanes]
-            self.run_dir.append_metrics(self.runner.env_steps, self.times.wall, index, metrics)
+        index = [lane.index for lane in self.experiment.lanes]
+        processes.from_first(lambda: self.run_dir.append_metrics(self.runner.env_steps, self.times.wall, index, metrics))
         self.view.write(self.runner.env_steps, metrics)
         for sink in self.sinks:
             sink.write(self.runner.env_steps, metrics)
@@ -180,8 +179,7 @@ class Training:
     def _sample_tasks(self) -> None:
         if self.runner.generates:
             w = self.runner.propose(TASKS_PER_LANE)
-            if processes.is_first():
-                self.run_dir.write_tasks(self.runner.env_steps, w)
+            processes.from_first(lambda: self.run_dir.write_tasks(self.runner.env_steps, w))
 
     def _patiently(self, work: Callable[[], T]) -> T:
         """Does long work and stays able to answer an interrupt."""

@@ -38,10 +38,10 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def start(cache):
-    def popen(*options: str) -> subprocess.Popen[str]:
+    def popen(*options: str, stderr: int | None = None) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "tests.corridor_runs", *options]
         environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache), "JAX_PLATFORMS": "cpu"}
-        return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
+        return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=stderr, text=True)
 
     return popen
 
@@ -87,14 +87,33 @@ def raw(leaf):
     return np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
 
 
-def test_two_processes_train_as_one_and_one_goes_on_for_both(tmp_path, start, whole):
-    """Nine lanes on the eight devices of two processes, which one interrupt stops together, then on two devices."""
+def meeting_place() -> list[str]:
+    """The options by which two processes find each other, but for the number of each."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
+    return ["--distributed", "--coordinator-address", address, "--num-processes", "2", "--process-id"]
+
+
+def test_what_one_process_lacks_stops_both(tmp_path, start):
+    """As a file or a plug-in that only one host has."""
+    options = ["--run-dir", str(tmp_path / "run"), "--method", "random", *OPTIONS, "--devices", "1"]
+    meet = meeting_place()
+    with (
+        start(*options, "--target", "far", *meet, "0", stderr=subprocess.PIPE) as first,
+        start(*options, "--target", "nowhere", *meet, "1", stderr=subprocess.PIPE) as second,
+    ):
+        told = [process.communicate(timeout=120)[1] for process in (first, second)]
+    assert 0 not in (first.returncode, second.returncode)
+    assert "stopped, because another process did" in told[0]
+    assert "unknown target of corridor 'nowhere'" in told[1]
+
+
+def test_two_processes_train_as_one_and_one_goes_on_for_both(tmp_path, start, whole):
+    """Nine lanes on the eight devices of two processes, which one interrupt stops together, then on two devices."""
     run = tmp_path / "run"
-    options = ["--run-dir", str(run), "--target", "far", "--method", "random", *OPTIONS, "--devices", "4", "--distributed"]
-    address = ["--coordinator-address", address, "--num-processes", "2", "--process-id"]
+    distributed, *address = meeting_place()
+    options = ["--run-dir", str(run), "--target", "far", "--method", "random", *OPTIONS, "--devices", "4", distributed]
     with start(*options, *address, "0") as first, start(*options, *address, "1") as second:
         next(line for line in first.stdout if "steps/s" in line)
         second.send_signal(signal.SIGINT)
