@@ -153,7 +153,7 @@ class Config:
     "Steps" are environment steps of all sources together unless a field says otherwise.
 
     Attributes:
-      method: a name in `apt_jax.methods.METHODS`, or such a name and that of an intrinsic reward, as in "apt_gen+rnd".
+      method: a name in `apt_jax.methods.METHODS` or of a curriculum, or such a name and a bonus's, as in "apt_gen+rnd".
       envs_per_source: environments side by side in each source (target, generated).
       warmup_steps: steps collected by a uniformly random policy before any update (paper: 10,000).
       updates_per_step: policy updates per environment step (paper: 10).

@@ -36,13 +36,13 @@ METHODS: dict[str, Method] = {
 
 
 def parse_method(name: str) -> Method:
-    """The method called `name`: one of `METHODS`, or with a bonus added, as in "apt_gen+rnd".
+    """The method called `name`: one of `METHODS`, or a curriculum by its own name; with a bonus added as in "apt_gen+rnd".
 
     Raises:
       ValueError: an unknown name, with the closest one, or a second bonus.
     """
     base, plus, bonus = name.partition("+")
-    method = look_up(METHODS, base, "method")
+    method = look_up({name: Method(name) for name in CURRICULA} | METHODS, base, "method")
     if not plus:
         return method
     if method.bonus != "none":

@@ -8,10 +8,8 @@ from __future__ import annotations
 from functools import partial
 
 from apt_jax.curricula import CURRICULA
-from apt_jax.methods import METHODS, Method
 from envs.grid_world import Space
 from experiments import ladder
 
 for _name in Space.targets:
     CURRICULA[f"ladder_{_name}"] = partial(ladder.make, target=_name)
-    METHODS[f"ladder_{_name}"] = Method(f"ladder_{_name}")

@@ -13,7 +13,6 @@ import envs
 from apt_jax import replay as rp
 from apt_jax.config import Config, HParams
 from apt_jax.curricula import CURRICULA
-from apt_jax.methods import METHODS
 from envs.grid_world.placement import parameter, place
 from envs.grid_world.solver import solve
 from experiments import ladder, settings, train
@@ -42,10 +41,8 @@ def test_there_is_no_ladder_in_another_space():
 
 
 def test_a_plug_in_adds_its_methods_to_a_run_and_is_remembered_by_it(tmp_path, monkeypatch):
-    for registry in (CURRICULA, METHODS):  # both are as they were afterwards
-        monkeypatch.setitem(registry, "ladder_A", None)
-        monkeypatch.setitem(registry, "ladder_B", None)
-        monkeypatch.setitem(registry, "ladder_C", None)
+    for name in ("ladder_A", "ladder_B", "ladder_C"):  # it is as it was afterwards
+        monkeypatch.setitem(CURRICULA, name, None)
     monkeypatch.delitem(sys.modules, PLUGIN, raising=False)
     options = ["--plugins", PLUGIN, "--method", "ladder_C", "--target", "C"]
     experiment, session = settings.parse(["--run-dir", str(tmp_path), *options])
