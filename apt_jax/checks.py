@@ -13,38 +13,6 @@ from apt_jax.specs import Vector, obs_struct, param_struct
 from apt_jax.task_space import TaskSpace, task_struct
 
 
-def check_counts(config: Config) -> None:
-    """Check that whatever is counted is there at least once.
-
-    Raises:
-      ValueError: the field, its value, and what is allowed.
-    """
-    counts = (
-        "envs_per_source",
-        "refresh_every",
-        "eval_every",
-        "updates_per_step",
-        "n_step",
-        "replay_episodes",
-        "model_batch_size",
-        "rollout_steps",
-        "recent_steps",
-        "value_ensemble",
-        "alp_window",
-        "alp_history",
-        "goal_rollouts",
-        "goal_tasks",
-        "goal_memory",
-        "noise_size",
-        "return_window",
-        "eval_episodes",
-        "probe_tasks",
-    )
-    for name in counts:
-        if getattr(config, name) < 1:
-            raise ValueError(f"{name} must be at least 1, got {getattr(config, name)}")
-
-
 def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> None:
     """Check that the sizes of a configuration fit together.
 
@@ -94,7 +62,6 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
         not learns or (config.model_batch_size >= 2 and config.model_batch_size % sources == 0),
         f"model_batch_size must be at least 2 and a multiple of the {sources} sources, got {config.model_batch_size}",
     )
-    require(math.isfinite(config.blank_bias), f"blank_bias must be finite, got {config.blank_bias}")
     require(
         config.recent_steps >= longest,
         f"recent_steps must hold one horizon of every environment: at least {longest}, got {config.recent_steps}",

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal, NamedTuple, get_origin, get_type_hints
 
 import flax.struct
 import numpy as np
@@ -15,6 +14,44 @@ Covariance = Literal["full", "diagonal"]
 
 BetaRule = Literal["doubling", "proportional"]
 """How beta follows the return of generated tasks."""
+
+
+class Range(NamedTuple):
+    """Numbers from `low` to `high`, and how to say so."""
+
+    low: float
+    high: float
+    words: str
+
+
+_SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+
+Share = Annotated[float, Range(0.0, 1.0, "in [0, 1]")]
+Finite = Annotated[float, Range(-_LARGEST, _LARGEST, "finite")]
+NotNegative = Annotated[float, Range(0.0, _LARGEST, "finite and at least 0")]
+PositiveFinite = Annotated[float, Range(_SMALLEST, _LARGEST, "finite and above 0")]
+Positive = Annotated[float, Range(_SMALLEST, math.inf, "above 0")]
+AtLeastZero = Annotated[float, Range(0.0, math.inf, "at least 0")]
+AtLeastOne = Annotated[float, Range(1.0, math.inf, "at least 1")]
+Count = Annotated[int, Range(1.0, math.inf, "at least 1")]
+
+
+def ranges(kind: type) -> dict[str, Range]:
+    """The ranges of a class's fields, as far as their types have one."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: hint.__metadata__[0] for name, hint in hints.items() if get_origin(hint) is Annotated}
+
+
+def check_ranges(numbers: HParams | Config) -> None:
+    """Check every field that has a range; for plain numbers, before they are traced.
+
+    Raises:
+      ValueError: the field, its value, and what is allowed.
+    """
+    for name, (low, high, allowed) in ranges(type(numbers)).items():
+        value = getattr(numbers, name)
+        if not low <= value <= high:
+            raise ValueError(f"{name} must be {allowed}, got {value:g}")
 
 
 @flax.struct.dataclass
@@ -64,77 +101,48 @@ class HParams:
       goal_learning_rate: RMSProp step size of GoalGAN's two networks, >= 0 (its reference 1e-3).
     """
 
-    learning_rate: float = 3e-4
-    discriminator_learning_rate: float = 3e-4
-    value_learning_rate: float = 3e-4
-    generator_learning_rate: float = 3e-4
-    gamma: float = 0.99
-    target_rate: float = 0.005
-    reset_every: float = math.inf
-    epsilon_start: float = 1.0
-    epsilon_end: float = 0.1
-    epsilon_steps: float = 1_000.0
-    delta: float = 0.5
-    tolerance: float = 0.1
-    beta_init: float = 1.0
-    beta_min: float = 0.125
-    beta_max: float = 8.0
-    pessimism: float = 1.0
-    value_weight_decay: float = 0.0
-    recency: float = 1.0
-    cell_noise: float = 0.0
-    vector_noise: float = 0.0
-    vector_prior: float = 0.0
-    spectral_bound: float = math.inf
-    bonus_learning_rate: float = 3e-4
-    icm_scale: float = 0.01
-    rnd_scale: float = 1.0
-    ride_scale: float = 0.1
-    alp_random_share: float = 0.2
-    alp_regularisation: float = 1e-5
-    goal_low: float = 0.25
-    goal_high: float = 0.75
-    goal_old_share: float = 0.2
-    goal_noise: float = 0.01
-    goal_learning_rate: float = 1e-3
+    learning_rate: NotNegative = 3e-4
+    discriminator_learning_rate: NotNegative = 3e-4
+    value_learning_rate: NotNegative = 3e-4
+    generator_learning_rate: NotNegative = 3e-4
+    gamma: Share = 0.99
+    target_rate: Share = 0.005
+    reset_every: Positive = math.inf
+    epsilon_start: Share = 1.0
+    epsilon_end: Share = 0.1
+    epsilon_steps: Positive = 1_000.0
+    delta: Finite = 0.5
+    tolerance: AtLeastZero = 0.1
+    beta_init: PositiveFinite = 1.0
+    beta_min: PositiveFinite = 0.125
+    beta_max: PositiveFinite = 8.0
+    pessimism: NotNegative = 1.0
+    value_weight_decay: NotNegative = 0.0
+    recency: AtLeastOne = 1.0
+    cell_noise: Share = 0.0
+    vector_noise: NotNegative = 0.0
+    vector_prior: NotNegative = 0.0
+    spectral_bound: Positive = math.inf
+    bonus_learning_rate: NotNegative = 3e-4
+    icm_scale: NotNegative = 0.01
+    rnd_scale: NotNegative = 1.0
+    ride_scale: NotNegative = 0.1
+    alp_random_share: Share = 0.2
+    alp_regularisation: PositiveFinite = 1e-5
+    goal_low: Share = 0.25
+    goal_high: Share = 0.75
+    goal_old_share: Share = 0.2
+    goal_noise: NotNegative = 0.01
+    goal_learning_rate: NotNegative = 1e-3
 
 
 def check_hparams(hparams: HParams) -> None:
-    """Check the ranges that the fields' descriptions give; for plain numbers, before they are traced.
+    """Check the fields' ranges, and what must hold between them; for plain numbers, before they are traced.
 
     Raises:
       ValueError: the field, its value, and what is allowed.
     """
-    positive = ("reset_every", "epsilon_steps", "spectral_bound")
-    positive_finite = ("beta_min", "beta_max", "alp_regularisation")
-    rates = tuple(field.name for field in dataclasses.fields(hparams) if field.name.endswith("learning_rate"))
-    scales = ("icm_scale", "rnd_scale", "ride_scale")
-    not_negative = ("pessimism", "value_weight_decay", "vector_noise", "vector_prior", "goal_noise")
-    shares = (
-        "gamma",
-        "target_rate",
-        "epsilon_start",
-        "epsilon_end",
-        "cell_noise",
-        "alp_random_share",
-        "goal_low",
-        "goal_high",
-        "goal_old_share",
-    )
-    smallest, largest = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
-    ranges = {
-        "recency": (1.0, math.inf, "at least 1"),
-        "tolerance": (0.0, math.inf, "at least 0"),
-        "delta": (-largest, largest, "finite"),
-        **dict.fromkeys(positive, (smallest, math.inf, "above 0")),
-        **dict.fromkeys(positive_finite, (smallest, largest, "finite and above 0")),
-        **dict.fromkeys(not_negative + rates + scales, (0.0, largest, "finite and at least 0")),
-        **dict.fromkeys(shares, (0.0, 1.0, "in [0, 1]")),
-    }
-    for name, (low, high, allowed) in ranges.items():
-        value = getattr(hparams, name)
-        if not low <= value <= high:
-            raise ValueError(f"{name} must be {allowed}, got {value:g}")
+    check_ranges(hparams)
     if hparams.beta_min > hparams.beta_max:
         raise ValueError(f"beta_min must be at most beta_max={hparams.beta_max:g}, got {hparams.beta_min:g}")
     if not hparams.beta_min <= hparams.beta_init <= hparams.beta_max:
@@ -194,36 +202,36 @@ class Config:
     """
 
     method: str = "apt_gen"
-    envs_per_source: int = 1
+    envs_per_source: Count = 1
     warmup_steps: int = 10_000
-    updates_per_step: int = 10
+    updates_per_step: Count = 10
     batch_size: int = 128
     success_share: float = 0.0
-    n_step: int = 1
+    n_step: Count = 1
     replay_steps: int = 100_000
-    replay_episodes: int = 10_000
+    replay_episodes: Count = 10_000
     model_updates_per_step: float = 1.0
-    model_batch_size: int = 128
-    rollout_steps: int = 4
+    model_batch_size: Count = 128
+    rollout_steps: Count = 4
     judge_parts: bool = False
-    recent_steps: int = 10_000
+    recent_steps: Count = 10_000
     relative_progress: bool = False
-    blank_bias: float = 0.0
-    value_ensemble: int = 1
-    noise_size: int = 32
+    blank_bias: Finite = 0.0
+    value_ensemble: Count = 1
+    noise_size: Count = 32
     beta_rule: BetaRule = "doubling"
-    alp_window: int = 250
-    alp_history: int = 2_000
+    alp_window: Count = 250
+    alp_history: Count = 2_000
     alp_fit_every: int = 5_000
     alp_covariance: Covariance = "full"
-    goal_rollouts: int = 2
-    goal_tasks: int = 100
-    goal_memory: int = 1_000
-    refresh_every: int = 500
-    return_window: int = 50
-    eval_every: int = 1_000
-    eval_episodes: int = 50
-    probe_tasks: int = 64
+    goal_rollouts: Count = 2
+    goal_tasks: Count = 100
+    goal_memory: Count = 1_000
+    refresh_every: Count = 500
+    return_window: Count = 50
+    eval_every: Count = 1_000
+    eval_episodes: Count = 50
+    probe_tasks: Count = 64
 
 
 PRESETS: dict[str, tuple[Config, HParams]] = {

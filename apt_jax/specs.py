@@ -44,6 +44,16 @@ class Vector:
         """The largest magnitude a number can have."""
         return max(abs(self.low), abs(self.high))
 
+    @property
+    def observation(self) -> jax.ShapeDtypeStruct:
+        """What is stored of an observation."""
+        return jax.ShapeDtypeStruct((self.size,), jnp.dtype(self.dtype))
+
+    @property
+    def parameter(self) -> jax.ShapeDtypeStruct:
+        """A block of a task parameter."""
+        return jax.ShapeDtypeStruct((self.size,), jnp.float32)
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -61,6 +71,16 @@ class Grid:
         if min(self.height, self.width) < 1 or self.categories < 2:
             raise ValueError(f"Grid needs height, width >= 1 and categories >= 2, got {self}")
 
+    @property
+    def observation(self) -> jax.ShapeDtypeStruct:
+        """What is stored of an observation."""
+        return jax.ShapeDtypeStruct((self.height, self.width), jnp.uint8)
+
+    @property
+    def parameter(self) -> jax.ShapeDtypeStruct:
+        """A block of a task parameter."""
+        return jax.ShapeDtypeStruct((self.height, self.width, self.categories), jnp.float32)
+
 
 @dataclass(frozen=True)
 class Table:
@@ -77,6 +97,16 @@ class Table:
         if self.rows < 1 or self.categories < 2:
             raise ValueError(f"Table needs rows >= 1 and categories >= 2, got {self}")
 
+    @property
+    def observation(self) -> jax.ShapeDtypeStruct:
+        """What is stored of an observation."""
+        return jax.ShapeDtypeStruct((self.rows,), jnp.uint8)
+
+    @property
+    def parameter(self) -> jax.ShapeDtypeStruct:
+        """A block of a task parameter."""
+        return jax.ShapeDtypeStruct((self.rows, self.categories), jnp.float32)
+
 
 Modality: TypeAlias = Vector | Grid | Table
 Spec: TypeAlias = Mapping[str, Modality]
@@ -86,32 +116,12 @@ Params: TypeAlias = dict[str, Array]
 
 def obs_struct(spec: Spec) -> dict[str, jax.ShapeDtypeStruct]:
     """Shapes and dtypes of one stored observation."""
-
-    def struct(modality: Modality) -> jax.ShapeDtypeStruct:
-        match modality:
-            case Vector():
-                return jax.ShapeDtypeStruct((modality.size,), jnp.dtype(modality.dtype))
-            case Grid():
-                return jax.ShapeDtypeStruct((modality.height, modality.width), jnp.uint8)
-            case Table():
-                return jax.ShapeDtypeStruct((modality.rows,), jnp.uint8)
-
-    return {name: struct(modality) for name, modality in spec.items()}
+    return {name: modality.observation for name, modality in spec.items()}
 
 
 def param_struct(spec: Spec) -> dict[str, jax.ShapeDtypeStruct]:
     """Shapes and dtypes of one task parameter `w`."""
-
-    def struct(modality: Modality) -> jax.ShapeDtypeStruct:
-        match modality:
-            case Vector():
-                return jax.ShapeDtypeStruct((modality.size,), jnp.float32)
-            case Grid():
-                return jax.ShapeDtypeStruct((modality.height, modality.width, modality.categories), jnp.float32)
-            case Table():
-                return jax.ShapeDtypeStruct((modality.rows, modality.categories), jnp.float32)
-
-    return {name: struct(modality) for name, modality in spec.items()}
+    return {name: modality.parameter for name, modality in spec.items()}
 
 
 def flatten(spec: Spec, w: Params) -> Float[Array, "*batch D"]:

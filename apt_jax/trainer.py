@@ -20,8 +20,8 @@ from jaxtyping import Array, Float, Int, Key
 
 from apt_jax import evaluation, learner, replay, workers
 from apt_jax.bonuses.base import Step
-from apt_jax.checks import check_counts, check_sizes, check_space, check_target
-from apt_jax.config import Config, HParams
+from apt_jax.checks import check_sizes, check_space, check_target
+from apt_jax.config import Config, HParams, check_ranges
 from apt_jax.curricula.base import GENERATED, TARGET
 from apt_jax.methods import make_method
 from apt_jax.networks import QNetwork
@@ -102,7 +102,7 @@ def make_trainer(space: TaskSpace, config: Config) -> Trainer:
     """
     if jax.dtypes.canonicalize_dtype(float) != jnp.float32:
         raise ValueError("apt_jax computes with 32 bits: unset jax_enable_x64 (JAX_ENABLE_X64)")
-    check_counts(config)
+    check_ranges(config)
     check_space(space)
     curriculum, bonus = make_method(space, config)
     sources = 2 if curriculum.generates else 1

@@ -17,7 +17,7 @@ from jax.sharding import PartitionSpec
 import envs
 from apt_jax import checkpoint, workers
 from apt_jax.bonuses import BONUSES
-from apt_jax.config import PRESETS, Config, HParams
+from apt_jax.config import PRESETS, Config, HParams, ranges
 from apt_jax.descent import has_learned
 from apt_jax.evaluation import diversity
 from apt_jax.lanes import _spread, lane_bytes, make_program, room, stack_hparams, stack_targets
@@ -265,6 +265,10 @@ def test_an_episode_is_a_success_if_any_of_its_steps_is():
 def test_hparams_out_of_range_are_refused():
     with pytest.raises(ValueError, match=r"gamma must be in \[0, 1\], got 1.5"):
         stack_hparams([HParams(), HParams(gamma=1.5)])
+
+
+def test_every_hyper_parameter_has_a_range():
+    assert list(ranges(HParams)) == [field.name for field in dataclasses.fields(HParams)]
 
 
 def test_a_method_of_unknown_parts_is_refused(monkeypatch):
