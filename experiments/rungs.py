@@ -13,18 +13,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from jaxtyping import Array, Bool, Float, Int, Key
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from scipy import stats
 
 from apt_jax import evaluation, learner
 from apt_jax.config import HParams
+from apt_jax.curricula import apt_gen
 from apt_jax.curricula.apt_gen import AptGenState
 from apt_jax.curricula.apt_gen_objectives import make_objectives
-from apt_jax.networks import QNetwork, spectral_normalize
+from apt_jax.networks import QNetwork
 from apt_jax.specs import Obs, Params
 from apt_jax.trainer import Trainer
 from experiments import markdown, runtime, settings
@@ -122,15 +123,8 @@ def judge(
 
         outcome, transitions = evaluation.play(space, jax.vmap(space.instantiate)(w), act, key_play)
         rollouts = evaluation.sample_rollouts(w, outcome, transitions, key_steps, steps=STEPS_SEEN)
-        models, spectral = curriculum.models, curriculum.spectral
-        discriminator, _ = spectral_normalize(models.discriminator, spectral, bound=hparams.spectral_bound)
-        return Judgement(
-            logit=objectives.score(discriminator, rollouts),
-            progress=jnp.mean(objectives.evaluate(models.progress_value, w), axis=0),
-            value=jnp.mean(objectives.evaluate(models.return_value, w), axis=0),
-            episode_return=outcome.episode_return,
-            success=outcome.success,
-        )
+        said = apt_gen.judge(objectives, curriculum, rollouts, hparams)
+        return Judgement(*said, episode_return=outcome.episode_return, success=outcome.success)
 
     return jax.jit(jax.vmap(of_lane, in_axes=(0, 0, 0, None)))(policies, curricula, hparams, w)
 
@@ -176,6 +170,8 @@ def draw(file: Path, ladder: Ladder, judged: Judgement) -> None:
         axes.plot(ladder.steps, by_lane.mean(axis=0), color="black", linewidth=2)
         axes.set_title(title, fontsize="medium")
         axes.set_xlabel("steps of the shortest solution")
+    thin, thick = Line2D([], [], color="C0", linewidth=0.8), Line2D([], [], color="black", linewidth=2)
+    figure.legend([thin, thick], ["each lane", "mean"], loc="outside lower center", ncols=2, fontsize="small")
     figure.savefig(file, dpi=150)
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, Key
 from apt_jax import draws
 from apt_jax import replay as rp
 from apt_jax.config import BetaRule, Config, HParams
-from apt_jax.curricula.apt_gen_objectives import make_objectives, task_progress
+from apt_jax.curricula.apt_gen_objectives import Objectives, make_objectives, task_progress
 from apt_jax.curricula.base import GENERATED, TARGET, Curriculum
 from apt_jax.descent import ADAM, descend
 from apt_jax.losses import adapt_beta, proportional_beta
@@ -185,20 +185,35 @@ def make(space: TaskSpace, config: Config, *, progress_weight: float = 1.0, retu
         return state._replace(beta=beta)
 
     def report(state: AptGenState, rollouts: rp.Rollouts, hparams: HParams) -> Metrics:
-        discriminator, _ = spectral_normalize(state.models.discriminator, state.spectral, bound=hparams.spectral_bound)
-        logit = objectives.score(discriminator, rollouts)
-        progress = task_progress(logit, relative=config.relative_progress)
-        expected_progress = jnp.mean(objectives.evaluate(state.models.progress_value, rollouts.w), axis=0)
-        expected_return = jnp.mean(objectives.evaluate(state.models.return_value, rollouts.w), axis=0)
+        said = judge(objectives, state, rollouts, hparams)
+        progress = task_progress(said.logit, relative=config.relative_progress)
         return {
             "beta": state.beta,
-            "probe_logit": jnp.mean(logit),
-            "v1_correlation": correlation(expected_progress, progress),
-            "v2_correlation": correlation(expected_return, rollouts.episode_return),
-            "v2_bias": jnp.mean(expected_return - rollouts.episode_return),
+            "probe_logit": jnp.mean(said.logit),
+            "v1_correlation": correlation(said.progress, progress),
+            "v2_correlation": correlation(said.value, rollouts.episode_return),
+            "v2_bias": jnp.mean(said.value - rollouts.episode_return),
         }
 
     return Curriculum(True, init, propose, update, refresh, report)
+
+
+class Judgement(NamedTuple):
+    """What the models say of rollouts and of their tasks: D's pooled logit, V1 and V2 (the ensembles' means)."""
+
+    logit: Float[Array, "n"]
+    progress: Float[Array, "n"]
+    value: Float[Array, "n"]
+
+
+def judge(objectives: Objectives, state: AptGenState, rollouts: rp.Rollouts, hparams: HParams) -> Judgement:
+    """Asks the models about n rollouts."""
+    discriminator, _ = spectral_normalize(state.models.discriminator, state.spectral, bound=hparams.spectral_bound)
+    progress, value = (
+        jnp.mean(objectives.evaluate(ensemble, rollouts.w), axis=0)
+        for ensemble in (state.models.progress_value, state.models.return_value)
+    )
+    return Judgement(objectives.score(discriminator, rollouts), progress, value)
 
 
 def explore(spec: Spec, w: Params, key: Key[Array, ""], hparams: HParams) -> Params:
