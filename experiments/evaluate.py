@@ -1,4 +1,4 @@
-"""Score the policies of a run on any target of its space: `python -m experiments.evaluate --run-dir DIR --target B`."""
+"""Score what a run has learned on any target of its space: `python -m experiments.evaluate --run-dir DIR --target B`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from experiments.runner import load_lanes
 
 @dataclass(frozen=True)
 class Args:
-    """Score the policies of a run on any target of its space.
+    """Score the kept policy of every seed of a run on any target of its space.
 
     Attributes:
       run_dir: a directory that experiments.train wrote.
