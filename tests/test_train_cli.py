@@ -24,7 +24,7 @@ from apt_jax.config import PRESETS, Config, HParams
 from apt_jax.methods import METHODS
 from experiments import evaluate, run_dir, settings, sinks, train
 from experiments.errors import UsageError
-from experiments.problem import make_problem
+from experiments.problem import load_target, make_problem
 from experiments.run_dir import RunDir
 from experiments.settings import Experiment, Session
 
@@ -155,6 +155,16 @@ def test_a_file_does_not_hide_a_target_of_its_name(tmp_path, monkeypatch):
 def test_help_names_every_space_and_method():
     text = f"{settings.Experiment.__doc__} {settings.Session.__doc__}"
     assert all(name in text for name in (*envs.SPACES, *METHODS))
+
+
+def test_a_target_file_without_a_solution_is_refused(tmp_path):
+    closed, open_ = tmp_path / "closed.txt", tmp_path / "open.txt"
+    rows = ["A......."] + ["........"] * 5 + ["......##", "......#G"]
+    closed.write_text("\n".join(rows))
+    open_.write_text("\n".join([*rows[:-2], "........", rows[-1]]))
+    with pytest.raises(UsageError, match=r"closed.txt: no 50 steps, an episode's longest, solve this task"):
+        load_target("grid_world", str(closed), closed)
+    load_target("grid_world", str(open_), open_)
 
 
 def test_several_values_are_a_sweep_over_every_seed(tmp_path):
