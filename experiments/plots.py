@@ -185,7 +185,7 @@ def progression(file: Path, boards: Mapping[int, Sequence[Image]], target: Image
       boards: by environment step, one picture per row.
       rows: titles of the rows.
     """
-    height = 1.7 * target.shape[0] / target.shape[1] - 0.1
+    height = max(1.7 * target.shape[0] / target.shape[1] - 0.1, 0.5)
     figure = Figure(figsize=(1.7 * (len(boards) + 1), height * len(rows) + 0.3), layout="constrained")
     grid = figure.subplots(len(rows), len(boards) + 1, squeeze=False)
     for column, (env_steps, pictures) in enumerate(boards.items()):

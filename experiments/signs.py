@@ -119,12 +119,12 @@ def error(expected: Float[np.ndarray, "T"], returned: Float[np.ndarray, "T"]) ->
 
 
 def over_time(env_steps: Int[np.ndarray, "T"], values: Float[np.ndarray, "T"] | None, digits: int) -> str:
-    """A curve at each quarter of the steps."""
+    """A curve at each quarter of the steps, a dash where nothing was known yet."""
     if values is None:
         return "-"
     windows = [values[env_steps * 4 <= env_steps[-1] * quarter][-5:] for quarter in (1, 2, 3, 4)]
     means = [np.mean(window[np.isfinite(window)]) if np.isfinite(window).any() else np.nan for window in windows]
-    return " ".join(f"{mean:.{digits}f}" for mean in means)
+    return " ".join("-" if np.isnan(mean) else f"{mean:.{digits}f}" for mean in means)
 
 
 if __name__ == "__main__":

@@ -89,8 +89,8 @@ class Corridor:
         return np.array(int(text), np.int32)
 
     def render(self, task: Any, state: State | None = None, tile_size: int = 32) -> UInt8[np.ndarray, "height width 3"]:
-        """White tiles, the goal green, the agent red."""
-        tiles = np.full((1, LENGTH, 3), 255, np.uint8)
+        """Grey tiles, the goal green, the agent red."""
+        tiles = np.full((1, LENGTH, 3), 220, np.uint8)
         tiles[0, int(task)] = 0, 160, 0
         tiles[0, 0 if state is None else int(state.position)] = 220, 0, 0
         return np.kron(tiles, np.ones((tile_size, tile_size, 1), np.uint8))
