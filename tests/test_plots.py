@@ -18,18 +18,20 @@ def read(file: Path) -> np.ndarray:
         return np.asarray(image)
 
 
-def test_learning_curves_skip_metrics_a_method_lacks(tmp_path):
+def test_learning_curves_skip_metrics_a_method_lacks_and_go_on_in_a_second_row(tmp_path):
     env_steps = np.arange(1, 6) * 1000
     one = {"target_return": np.zeros((2, 5)), "td_loss": np.ones((2, 5))}
     gaps = np.where(env_steps > 3000, np.nan, 4.0) * np.ones((2, 1))
     four = one | {"generated_episode_return": gaps, "beta": np.ones((2, 5)), "probe_solution_length": gaps}
-    widths = []
+    sizes = []
     for name, curves in {"one": one, "four": four}.items():
         file = tmp_path / f"{name}.png"
         seeds = np.array([[0.0] * 5, [3.0] * 5])
         plots.learning_curves(file, {"": (env_steps, {**curves, "seed": seeds})}, delta=0.5, title=name)
-        widths.append(read(file).shape[1])
-    assert widths[1] == 4 * widths[0]
+        sizes.append(read(file).shape[:2])
+    (low, narrow), (high, wide) = sizes
+    assert wide == 3 * narrow
+    assert 1.5 * low < high < 2 * low
 
 
 def test_comparisons_have_a_panel_per_target_and_curves_a_colour_per_setting(tmp_path):

@@ -19,7 +19,7 @@ def test_over_time_takes_the_mean_of_the_five_values_up_to_each_quarter_and_skip
     values = np.arange(40.0)
     values[39] = np.nan
     assert signs.over_time(np.arange(1, 41), values, 2) == "7.00 17.00 27.00 36.50"
-    assert signs.over_time(np.arange(1, 9), np.full(8, np.nan), 1) == "nan nan nan nan"
+    assert signs.over_time(np.arange(1, 9), np.full(8, np.nan), 1) == "- - - -"
     assert signs.over_time(np.arange(1, 9), None, 1) == "-"
 
 
