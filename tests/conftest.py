@@ -77,6 +77,7 @@ LONGEST = (
     "manipulation_physics",
     "train_cli",
     "runner",
+    "examples",
     "networks",
     "curricula",
     "compiled_program",
