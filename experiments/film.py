@@ -32,13 +32,13 @@ class Args:
       out: the GIF to write.
       target: a target's name, or a file that describes it.
       seed: random seed of the goal's place.
-      above: show the table from above, one picture per push, in any case.
+      robot: show the arm; without it, the table from above, one picture per push.
     """
 
     out: Path
     target: str = "A"
     seed: int = 0
-    above: bool = False
+    robot: bool = True
 
 
 def main() -> int:
@@ -63,7 +63,7 @@ def film(args: Args) -> None:
         raise UsageError(f"{file}: found no solution to film")
     sequence = jnp.asarray(actions)
     episode = episodes.play(space, task, lambda _, step: sequence[step], jax.random.key(args.seed))
-    save(args.out, space, task, episode, robot=not args.above)
+    save(args.out, space, task, episode, robot=args.robot)
 
 
 def check_robot(space: str) -> None:

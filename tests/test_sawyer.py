@@ -305,7 +305,7 @@ class TestFilm:
     def test_a_target_may_be_a_file(self, tmp_path):
         file = tmp_path / "one_push.txt"
         file.write_text("FFFFFF\nFFFFFF\nFFFFFF\nFFFFFF\ngoal 45 37\ncan 45 30\nrange 10")
-        film.film(film.Args(tmp_path / "film.gif", target=str(file), above=True))
+        film.film(film.Args(tmp_path / "film.gif", target=str(file), robot=False))
         frames, _ = gif_frames(tmp_path / "film.gif")
         assert 2 <= frames <= 4
 
