@@ -65,6 +65,7 @@ optax.tree.bias_correction = _standard_promotion(optax.tree.bias_correction)
 
 
 LONGEST = (
+    "torch_fixture",
     "trainer",
     "resuming",
     "sawyer",
@@ -82,7 +83,10 @@ LONGEST = (
     "curricula",
     "compiled_program",
 )
-"""Files that take half a minute or more."""
+"""Files that take half a minute or more.
+
+Before them the one that imports PyTorch: where OpenGL has drawn first, Mesa's LLVM and PyTorch's compiler end the process.
+"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
