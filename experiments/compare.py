@@ -17,7 +17,7 @@ import jax
 import tyro
 
 from apt_jax.methods import METHODS
-from experiments import jobs, plots, processes, report, settings
+from experiments import command_line, jobs, plots, processes, report
 from experiments.errors import UsageError, exit_with
 from experiments.interrupt import EXIT_CODE
 from experiments.problem import make_problem
@@ -137,7 +137,7 @@ def plan(comparison: Compare, options: Sequence[str]) -> list[tuple[Experiment, 
                 continue
             if (path / "config.json").is_file():
                 raise UsageError(f"{path} holds a run of all its seeds; leave --seeds-per-job away, or take another --out")
-            seeds = settings.parse(["--run-dir", str(path), *words])[0].seeds
+            seeds = command_line.parse(["--run-dir", str(path), *words])[0].seeds
             groups = [seeds[i : i + comparison.seeds_per_job] for i in range(0, len(seeds), comparison.seeds_per_job)]
             planned = {f"seeds_{'_'.join(map(str, own))}": own for own in groups}
             if others := parts - set(planned):
@@ -155,7 +155,7 @@ def plan(comparison: Compare, options: Sequence[str]) -> list[tuple[Experiment, 
 
 def _run(path: Path, words: Sequence[str]) -> tuple[Experiment, Session]:
     resume = ["--resume"] if (path / "config.json").is_file() else []
-    return settings.parse(["--run-dir", str(path), *resume, *words])
+    return command_line.parse(["--run-dir", str(path), *resume, *words])
 
 
 def run_path(comparison: Compare, method: str, target: str) -> Path:

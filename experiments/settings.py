@@ -1,54 +1,24 @@
-"""What a training run is asked to do: the command line, and the part of it that a run directory remembers."""
+"""What a training run is asked to do, and the part of it that a run directory remembers."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
 import shlex
-import sys
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
 import envs
-from apt_jax.config import PRESETS, Config, HParams, check_hparams
+from apt_jax.config import Config, HParams, check_hparams
 from apt_jax.lanes import Layout
-from apt_jax.registry import look_up
 from experiments import lanes, run_dir
 from experiments.errors import UsageError
-
-Preset = Literal["paper", "fast"]
+from experiments.presets import Preset
 
 SinkName = Literal["tensorboard", "wandb"]
-
-GAMMA: Mapping[str, float] = {"manipulation": 0.85, "manipulation_sawyer": 0.85}
-"""Spaces with a discount of their own, whatever the preset.
-
-None of Manipulation's 15 pushes costs anything: at 0.99 the way and a detour differ by less than a network can tell.
-"""
-
-TUNED: Mapping[tuple[str, str], Mapping[str, float]] = {
-    ("grid_world", "dqn"): {"gamma": 0.998},
-    ("grid_world", "random"): {"gamma": 0.998},
-    ("grid_world", "rnd"): {"rnd_scale": 0.1},
-    ("grid_world", "icm"): {"icm_scale": 0.0003},
-    ("grid_world", "ride"): {"ride_scale": 0.003},
-    ("manipulation", "dqn"): {"gamma": 0.92},
-    ("manipulation", "random"): {"gamma": 0.92},
-    ("manipulation", "alp_gmm"): {"alp_random_share": 0.5},
-    ("manipulation", "goal_gan"): {"goal_noise": 0.1},
-    ("manipulation", "rnd"): {"gamma": 0.92, "rnd_scale": 0.1},
-    ("manipulation", "icm"): {"icm_scale": 0.003},
-    ("manipulation", "ride"): {"ride_scale": 0.03},
-}
-"""Baselines that learn better with other hyper-parameters than preset fast has for all, by space and method.
-
-Found on target A of each space by the searches of experiments/NOTES.md, sections 20, 28 and 30; APT-Gen keeps one setting for
-every target.
-"""
 
 
 @dataclass(frozen=True)
@@ -131,82 +101,6 @@ class Session:
         return shlex.join(words)
 
 
-Values: Any = lanes.values_type()
-
-
-@dataclass(frozen=True)
-class _Basis:
-    """The options that decide the defaults of all others."""
-
-    run_dir: Path | None = None
-    resume: bool = False
-    preset: Preset | None = None
-    method: str | None = None
-    config_method: Annotated[str | None, tyro.conf.arg(name="config.method")] = None
-    space: str = Experiment.space
-    target: str | None = None
-
-
-def parse(args: Sequence[str] | None = None) -> tuple[Experiment, Session]:
-    """The command line; each option's default is the saved run's when resuming, else `starting_point`'s.
-
-    Raises:
-      UsageError: options that contradict each other or the saved run.
-    """
-    args = sys.argv[1:] if args is None else list(args)
-    basis, _ = tyro.cli(_Basis, args=args, add_help=False, return_unknown_args=True)
-    saved = load(basis.run_dir) if basis.resume and basis.run_dir else None
-    default = saved or Experiment()
-    if basis.preset or not saved:
-        space = saved.space if saved else basis.space
-        method = basis.method or basis.config_method or default.config.method
-        config, hparams = starting_point(basis.preset or "fast", space, method)
-        default = dataclasses.replace(default, config=config, hparams=hparams)
-
-    def train(
-        session: Annotated[Session, tyro.conf.arg(name=""), tyro.conf.FlagCreatePairsOff],
-        experiment: Annotated[Experiment, tyro.conf.arg(name="")] = dataclasses.replace(default, hparams=HParams()),  # noqa: B008
-        hparams: Values = Values(**lanes.to_values(default.hparams)),  # noqa: B008
-    ) -> tuple[Experiment, Session]:
-        """Train a method on one target task, all seeds in one compiled program.
-
-        Several values of one of the hparams are a sweep: every combination runs with every seed, in the same program.
-        """
-        return dataclasses.replace(experiment, hparams=lanes.from_values(dataclasses.asdict(hparams))), session
-
-    experiment, session = tyro.cli(train, args=args, prog="python -m experiments.train")
-    if session.method:
-        experiment = dataclasses.replace(experiment, config=dataclasses.replace(experiment.config, method=session.method))
-    if not saved or basis.target:
-        file = target_path(experiment.space, experiment.target)  # named again, it may not be what the run has kept of it
-        kept = saved.target_file if saved and saved.target == experiment.target else None
-        experiment = dataclasses.replace(experiment, target_file=file or kept)
-    check(experiment, session)
-    if saved:
-        check_resumable(saved, experiment)
-    return experiment, session
-
-
-def starting_point(preset: Preset, space: str, method: str) -> tuple[Config, HParams]:
-    """The preset for a method, with the space's own discount (`GAMMA`) and, for preset fast, what was tuned for it (`TUNED`).
-
-    Args:
-      preset: a name in `PRESETS`.
-      space: a task space's name, not the space itself; unknown ones have nothing of their own.
-      method: a method's full name, as in "rnd" or "apt_gen+rnd", which has nothing of "rnd"'s; unknown ones have nothing tuned.
-
-    Returns:
-      The preset's `Config` with that method, and the hyper-parameters, a number each.
-
-    Raises:
-      ValueError: an unknown preset.
-    """
-    config, hparams = look_up(PRESETS, preset, "preset")
-    own = {"gamma": GAMMA[space]} if space in GAMMA else {}
-    tuned = TUNED.get((space, method), {}) if preset == "fast" else {}
-    return dataclasses.replace(config, method=method), dataclasses.replace(hparams, **{**own, **tuned})
-
-
 def make_space(name: str) -> envs.BenchmarkSpace:
     """The task space called `name`; raises a `UsageError` if there is none, or this machine lacks what it needs."""
     try:
@@ -260,16 +154,6 @@ def check_processes(session: Session) -> None:
         raise UsageError(f"--process-id must be from 0 to --num-processes less 1, got {own} of {count}")
 
 
-def check_resumable(saved: Experiment, asked: Experiment) -> None:
-    """Raises a `UsageError` that names every difference; only `env_steps` may grow."""
-    if asked.env_steps < saved.env_steps:
-        raise UsageError(f"--env-steps may only grow on --resume: saved {saved.env_steps}, asked {asked.env_steps}")
-    old, new = _comparable(saved), _comparable(asked)
-    differing = [f"{name} (saved {old[name]}, asked {new[name]})" for name in old if old[name] != new[name]]
-    if differing:
-        raise UsageError(f"--resume must keep what the run was started with; it differs in {', '.join(differing)}")
-
-
 def load(directory: Path) -> Experiment:
     """The experiment of a run directory.
 
@@ -300,25 +184,3 @@ def _numbers(saved: Any) -> Any:
 def target_name(experiment: Experiment) -> str:
     """What to call the target in a title."""
     return experiment.target_file.name if experiment.target_file else experiment.target
-
-
-def _read(file: Path) -> str:
-    """The text of a file; raises a `UsageError` where there is none."""
-    try:
-        return file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{file} cannot be read as text: {error}") from error
-
-
-def _comparable(experiment: Experiment) -> dict[str, Any]:
-    """Every field under its option's name, the target file by its content; without `env_steps`."""
-    fields = dataclasses.asdict(experiment)
-    del fields["env_steps"]
-    config, hparams = fields.pop("config"), fields.pop("hparams")
-    if experiment.target_file:
-        fields |= {"target": "of a file", "target_file": _read(experiment.target_file)}
-    return {
-        **fields,
-        **{f"config.{name}": value for name, value in config.items()},
-        **{f"hparams.{name}": value for name, value in hparams.items()},
-    }

@@ -16,6 +16,7 @@ from typing import TypeVar
 import envs
 from apt_jax import checkpoint
 from experiments import pictures, processes, run_dir, runtime
+from experiments.command_line import parse
 from experiments.errors import UsageError, exit_with
 from experiments.interrupt import EXIT_CODE, Interrupt
 from experiments.problem import make_problem
@@ -23,7 +24,7 @@ from experiments.programs import Programs
 from experiments.progress import View, make_view
 from experiments.run_dir import RunDir
 from experiments.runner import Runner
-from experiments.settings import Experiment, Session, parse
+from experiments.settings import Experiment, Session
 from experiments.sinks import Metrics, Sink, check_installed, make_sinks
 from experiments.summary import Times, is_complete, summarise
 

@@ -12,7 +12,7 @@ from apt_jax.curricula.base import GENERATED
 from apt_jax.lanes import Program, stack_hparams
 from apt_jax.replay import Episode
 from apt_jax.trainer import Clock, make_trainer
-from experiments import foresight, settings, train
+from experiments import command_line, foresight, train
 from experiments.errors import UsageError
 from experiments.examples.corridor import Corridor
 
@@ -88,7 +88,7 @@ def test_periods_weigh_by_the_tasks_played():
 
 
 def test_only_apt_gen_has_v2(tmp_path, monkeypatch):
-    experiment, session = settings.parse(["--run-dir", str(tmp_path), "--method", "random"])
+    experiment, session = command_line.parse(["--run-dir", str(tmp_path), "--method", "random"])
     train.open_run(experiment, session)
     monkeypatch.setattr("sys.argv", ["foresight", "--run-dir", str(tmp_path)])
     monkeypatch.setattr("experiments.runtime.setup", lambda: None)

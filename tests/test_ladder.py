@@ -15,7 +15,7 @@ from apt_jax.config import Config, HParams
 from apt_jax.curricula import CURRICULA
 from envs.grid_world.placement import parameter, place
 from envs.grid_world.solver import solve
-from experiments import ladder, settings, train
+from experiments import command_line, ladder, settings, train
 from experiments.examples.corridor import Corridor
 from experiments.problem import make_problem
 
@@ -45,11 +45,11 @@ def test_a_plug_in_adds_its_methods_to_a_run_and_is_remembered_by_it(tmp_path, m
         monkeypatch.setitem(CURRICULA, name, None)
     monkeypatch.delitem(sys.modules, PLUGIN, raising=False)
     options = ["--plugins", PLUGIN, "--method", "ladder_C", "--target", "C"]
-    experiment, session = settings.parse(["--run-dir", str(tmp_path), *options])
+    experiment, session = command_line.parse(["--run-dir", str(tmp_path), *options])
     make_problem(experiment)
     train.open_run(experiment, session)
     assert settings.load(tmp_path) == experiment
-    assert settings.parse(["--run-dir", str(tmp_path), "--resume"])[0].plugins == (PLUGIN,)
+    assert command_line.parse(["--run-dir", str(tmp_path), "--resume"])[0].plugins == (PLUGIN,)
 
 
 def test_rungs_lead_from_one_step_to_the_target(climbing):

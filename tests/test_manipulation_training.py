@@ -14,7 +14,7 @@ import envs
 from apt_jax.checks import check_target
 from apt_jax.config import PRESETS
 from apt_jax.trainer import make_trainer
-from experiments import pictures, progression, run_dir, settings, train
+from experiments import command_line, pictures, progression, run_dir, settings, train
 from experiments.errors import UsageError
 from experiments.problem import make_problem
 from experiments.runner import load_lanes
@@ -59,7 +59,7 @@ def own_table_run(tmp_path_factory):
     options = [*OPTIONS, "--target", str(folder / "mine.txt"), "--run-dir", str(folder / "run")]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pictures, "draw", lambda *_: None)
-        assert train.train(*settings.parse(options)) == 0
+        assert train.train(*command_line.parse(options)) == 0
     return folder / "run"
 
 
@@ -86,7 +86,7 @@ def test_what_was_saved_is_where_the_table_has_it(own_table_run):
 def test_a_table_with_a_mistake_is_refused_at_once(tmp_path):
     (tmp_path / "mine.txt").write_text(TABLE.replace("#", "x"))
     with pytest.raises(UsageError, match=re.escape("mine.txt: line 4, column 3: unknown character 'x'")):
-        train.train(*settings.parse([*OPTIONS, "--target", str(tmp_path / "mine.txt"), "--run-dir", str(tmp_path / "run")]))
+        train.train(*command_line.parse([*OPTIONS, "--target", str(tmp_path / "mine.txt"), "--run-dir", str(tmp_path / "run")]))
     assert not (tmp_path / "run").exists()
 
 

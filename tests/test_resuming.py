@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 
 import envs
 from apt_jax import checkpoint
-from experiments import compare, pictures, settings, train
+from experiments import command_line, compare, pictures, settings, train
 from experiments.compare import Compare
 from experiments.examples.corridor import Corridor
 from experiments.problem import make_problem
@@ -153,10 +153,10 @@ def test_an_interrupt_during_the_warm_up_saves_it(tmp_path, monkeypatch):
     monkeypatch.setattr(Runner, "warmup", interrupted)
     run = tmp_path / "run"
     options = ["--target", "far", "--method", "dqn", *OPTIONS, "--seeds", "0", "--env-steps", "60"]
-    assert train.train(*settings.parse(["--run-dir", str(run), *options])) == 130
+    assert train.train(*command_line.parse(["--run-dir", str(run), *options])) == 130
     assert checkpoint.latest_step(run / "checkpoints") == 40
     monkeypatch.setattr(Runner, "warmup", None)  # it is not made again
-    assert train.train(*settings.parse(["--run-dir", str(run), "--resume"])) == 0
+    assert train.train(*command_line.parse(["--run-dir", str(run), "--resume"])) == 0
     assert [row["env_steps"] for row in rows(run)] == ["60"]
 
 

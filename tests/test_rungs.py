@@ -14,7 +14,7 @@ from apt_jax.config import PRESETS, HParams
 from apt_jax.lanes import stack_hparams
 from apt_jax.task_space import task_struct
 from apt_jax.trainer import make_trainer
-from experiments import rungs, settings, train
+from experiments import command_line, rungs, train
 from experiments.errors import UsageError
 from experiments.ladder import build
 
@@ -64,7 +64,7 @@ def test_models_of_every_lane_judge_every_task():
 
 
 def test_only_apt_gen_has_what_is_asked_about(tmp_path, monkeypatch):
-    experiment, session = settings.parse(["--run-dir", str(tmp_path), "--method", "random"])
+    experiment, session = command_line.parse(["--run-dir", str(tmp_path), "--method", "random"])
     train.open_run(experiment, session)
     monkeypatch.setattr("sys.argv", ["rungs", "--run-dir", str(tmp_path)])
     monkeypatch.setattr("experiments.runtime.setup", lambda: None)

@@ -22,7 +22,7 @@ import pytest
 import envs
 from apt_jax.config import PRESETS, Config, HParams
 from apt_jax.methods import METHODS
-from experiments import evaluate, run_dir, settings, sinks, train
+from experiments import command_line, evaluate, presets, run_dir, settings, sinks, train
 from experiments.errors import UsageError
 from experiments.problem import load_target, make_problem
 from experiments.run_dir import RunDir
@@ -39,7 +39,7 @@ TINY = shlex.split(
 
 def start_run(path: Path, *options: str) -> Experiment:
     """A run directory as the script leaves it before its first chunk."""
-    experiment, session = settings.parse(["--run-dir", str(path), *options])
+    experiment, session = command_line.parse(["--run-dir", str(path), *options])
     train.open_run(experiment, session)
     return experiment
 
@@ -83,7 +83,7 @@ def start_run(path: Path, *options: str) -> Experiment:
 )
 def test_mistakes_are_told_before_anything_is_written(tmp_path, options, message):
     def prepare():
-        experiment, _ = settings.parse(["--run-dir", str(tmp_path / "run"), *options.split()])
+        experiment, _ = command_line.parse(["--run-dir", str(tmp_path / "run"), *options.split()])
         make_problem(experiment)
 
     with pytest.raises(UsageError, match=message):
@@ -92,7 +92,7 @@ def test_mistakes_are_told_before_anything_is_written(tmp_path, options, message
 
 
 def test_options_override_the_preset(tmp_path):
-    experiment, _ = settings.parse(
+    experiment, _ = command_line.parse(
         ["--run-dir", str(tmp_path), "--preset", "fast", "--config.batch-size", "64", "--hparams.delta", "0.3"]
     )
     config, hparams = PRESETS["fast"]
@@ -103,44 +103,44 @@ def test_options_override_the_preset(tmp_path):
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize(("option", "value"), [("--config.judge-parts", True), ("--config.no-judge-parts", False)])
 def test_a_switch_has_both_names_whatever_the_preset(tmp_path, preset, option, value):
-    experiment, _ = settings.parse(["--run-dir", str(tmp_path), "--preset", preset, option])
+    experiment, _ = command_line.parse(["--run-dir", str(tmp_path), "--preset", preset, option])
     assert experiment.config.judge_parts == value
 
 
 @pytest.mark.parametrize("space", ["manipulation", "manipulation_sawyer"])
 def test_a_space_may_have_a_discount_of_its_own(tmp_path, space):
     words = ["--run-dir", str(tmp_path), "--preset", "fast", "--space", space]
-    experiment, _ = settings.parse(words)
-    assert experiment.hparams == PRESETS["fast"][1].replace(gamma=settings.GAMMA["manipulation"])
-    experiment, _ = settings.parse([*words, "--hparams.gamma", "0.9"])
+    experiment, _ = command_line.parse(words)
+    assert experiment.hparams == PRESETS["fast"][1].replace(gamma=presets.GAMMA["manipulation"])
+    experiment, _ = command_line.parse([*words, "--hparams.gamma", "0.9"])
     assert experiment.hparams.gamma == 0.9
 
 
 @pytest.mark.parametrize("option", ["--method", "--config.method"])
 def test_a_method_may_be_tuned_in_preset_fast(tmp_path, option):
     def parse(*options):
-        return settings.parse(["--run-dir", str(tmp_path), *options])[0]
+        return command_line.parse(["--run-dir", str(tmp_path), *options])[0]
 
-    tuned = settings.TUNED["grid_world", "rnd"]
+    tuned = presets.TUNED["grid_world", "rnd"]
     assert parse("--preset", "fast", option, "rnd").hparams == PRESETS["fast"][1].replace(**tuned)
     assert parse("--preset", "fast", option, "rnd", "--hparams.rnd-scale", "0.7").hparams.rnd_scale == 0.7
     assert (
         parse("--preset", "fast", "--method", "dqn", "--config.method", "rnd").hparams.gamma
-        == settings.TUNED["grid_world", "dqn"]["gamma"]
+        == presets.TUNED["grid_world", "dqn"]["gamma"]
     )
     assert parse("--preset", "fast", option, "apt_gen+rnd").hparams == PRESETS["fast"][1]
     assert parse("--preset", "paper", option, "rnd").hparams == HParams()
 
 
-@pytest.mark.parametrize(("space", "method"), settings.TUNED)
+@pytest.mark.parametrize(("space", "method"), presets.TUNED)
 def test_what_is_tuned_exists(tmp_path, space, method):
     envs.make(space)
     assert method in METHODS
     words = ["--run-dir", str(tmp_path), "--preset", "fast", "--space", space, "--method", method]
-    experiment = settings.parse(words)[0]
-    assert (experiment.config, experiment.hparams) == settings.starting_point("fast", space, method)
+    experiment = command_line.parse(words)[0]
+    assert (experiment.config, experiment.hparams) == presets.starting_point("fast", space, method)
     assert experiment.config.method == method
-    assert experiment.hparams != settings.starting_point("fast", space, "apt_gen")[1]
+    assert experiment.hparams != presets.starting_point("fast", space, "apt_gen")[1]
 
 
 def test_a_file_does_not_hide_a_target_of_its_name(tmp_path, monkeypatch):
@@ -176,9 +176,9 @@ def test_several_values_are_a_sweep_over_every_seed(tmp_path):
     assert lanes[6].name == "seed 1, delta 0.1"
     assert lanes[6].hparams == PRESETS["fast"][1].replace(delta=0.1, gamma=0.9)
     assert settings.load(tmp_path) == experiment
-    assert settings.parse(["--run-dir", str(tmp_path), "--resume"])[0] == experiment
+    assert command_line.parse(["--run-dir", str(tmp_path), "--resume"])[0] == experiment
     with pytest.raises(UsageError, match=r"hparams.delta \(saved \(-0.1, .*, asked 0.5\)"):
-        settings.parse(["--run-dir", str(tmp_path), "--resume", "--hparams.delta", "0.5"])
+        command_line.parse(["--run-dir", str(tmp_path), "--resume", "--hparams.delta", "0.5"])
 
 
 def test_rows_with_other_columns_are_refused_and_what_is_there_stays(tmp_path):
@@ -214,27 +214,27 @@ def test_a_run_is_never_overwritten(tmp_path):
 
 def test_resuming_defaults_to_the_saved_experiment(tmp_path):
     saved = start_run(tmp_path, *TINY)
-    resumed, _ = settings.parse(["--run-dir", str(tmp_path), "--resume"])
+    resumed, _ = command_line.parse(["--run-dir", str(tmp_path), "--resume"])
     assert resumed == saved
-    longer, _ = settings.parse(["--run-dir", str(tmp_path), "--resume", "--env-steps", "3000"])
+    longer, _ = command_line.parse(["--run-dir", str(tmp_path), "--resume", "--env-steps", "3000"])
     assert longer == dataclasses.replace(saved, env_steps=3000)
 
 
 def test_a_preset_named_again_keeps_the_method(tmp_path):
     saved = start_run(tmp_path, "--preset", "fast", "--method", "dqn")
-    assert settings.parse(["--run-dir", str(tmp_path), "--resume", "--preset", "fast"])[0] == saved
+    assert command_line.parse(["--run-dir", str(tmp_path), "--resume", "--preset", "fast"])[0] == saved
 
 
 def test_resuming_names_every_difference(tmp_path):
     start_run(tmp_path, *TINY)
     options = "--resume --config.batch-size 8 --hparams.delta 0.3 --target B"
     with pytest.raises(UsageError) as caught:
-        settings.parse(["--run-dir", str(tmp_path), *options.split()])
+        command_line.parse(["--run-dir", str(tmp_path), *options.split()])
     for difference in ("config.batch_size (saved 4, asked 8)", "hparams.delta (saved 0.5, asked 0.3)", "target (saved A"):
         assert difference in str(caught.value)
     assert "seeds" not in str(caught.value)
     with pytest.raises(UsageError, match="saved 1200, asked 1000"):
-        settings.parse(["--run-dir", str(tmp_path), "--resume", "--env-steps", "1000"])
+        command_line.parse(["--run-dir", str(tmp_path), "--resume", "--env-steps", "1000"])
 
 
 def test_a_target_file_named_again_is_the_one_that_the_run_has_kept(tmp_path):
@@ -242,21 +242,21 @@ def test_a_target_file_named_again_is_the_one_that_the_run_has_kept(tmp_path):
     file.write_text("first")
     start_run(tmp_path / "run", "--target", str(file))
     resume = ["--run-dir", str(tmp_path / "run"), "--resume", "--target", str(file)]
-    assert settings.parse(resume)[0].target == str(file)
-    assert settings.parse(resume[:-2])[0].target_file == tmp_path / "run" / "target.txt"
+    assert command_line.parse(resume)[0].target == str(file)
+    assert command_line.parse(resume[:-2])[0].target_file == tmp_path / "run" / "target.txt"
     with pytest.raises(UsageError, match=r"target \(saved of a file, asked B\)"):
-        settings.parse([*resume[:-1], "B"])
+        command_line.parse([*resume[:-1], "B"])
     copy = tmp_path / "copy.txt"
     copy.write_text("first")
-    settings.parse([*resume[:-1], str(copy)])
+    command_line.parse([*resume[:-1], str(copy)])
     file.write_text("second")
     with pytest.raises(UsageError, match=r"target_file \(saved first, asked second\)"):
-        settings.parse(resume)
+        command_line.parse(resume)
     file.unlink()
-    assert settings.parse(resume)[0].target_file == tmp_path / "run" / "target.txt"
+    assert command_line.parse(resume)[0].target_file == tmp_path / "run" / "target.txt"
     (tmp_path / "run" / "target.txt").unlink()
     with pytest.raises(UsageError, match=r"target.txt is no file"):
-        settings.parse(resume)
+        command_line.parse(resume)
 
 
 def test_infinite_values_of_a_sweep_are_saved_and_read(tmp_path):
@@ -375,7 +375,7 @@ def test_an_interrupted_run_says_how_to_go_on_and_ends_complete(tmp_path, capsys
     for name in ("learning_curves.png", "progression.png", "policy.gif", "tasks/seed_3.png"):
         assert (run / name).stat().st_size > 1000
 
-    assert train.train(*settings.parse(["--run-dir", str(run), "--resume"])) == 0
+    assert train.train(*command_line.parse(["--run-dir", str(run), "--resume"])) == 0
     assert "has all its 1,200 steps" in capsys.readouterr().out
     evaluate.evaluate(evaluate.Args(run, target="B", episodes=2, gif=tmp_path / "film.gif"))
     assert "B after 1,200 steps" in capsys.readouterr().out
@@ -383,10 +383,10 @@ def test_an_interrupted_run_says_how_to_go_on_and_ends_complete(tmp_path, capsys
 
     kept = (run / "metrics.csv").read_bytes()
     shutil.rmtree(run / "checkpoints")
-    assert train.train(*settings.parse(["--run-dir", str(run), "--resume"])) == 0
+    assert train.train(*command_line.parse(["--run-dir", str(run), "--resume"])) == 0
     (run / "summary.json").unlink()  # as of a run that was killed
     with pytest.raises(UsageError, match="has results, but no checkpoint to go on from"):
-        train.train(*settings.parse(["--run-dir", str(run), "--resume", "--env-steps", "1300"]))
+        train.train(*command_line.parse(["--run-dir", str(run), "--resume", "--env-steps", "1300"]))
     assert (run / "metrics.csv").read_bytes() == kept
     assert len(run_dir.task_files(run)) > 0
 
@@ -398,4 +398,4 @@ def rows(path: Path) -> list[tuple[int, int]]:
 
 def test_the_librarys_default_is_the_papers_and_the_command_lines_is_what_learns(tmp_path):
     assert Experiment().config == Config() == PRESETS["paper"][0]
-    assert settings.parse(["--run-dir", str(tmp_path)])[0].config == PRESETS["fast"][0]
+    assert command_line.parse(["--run-dir", str(tmp_path)])[0].config == PRESETS["fast"][0]
