@@ -19,15 +19,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from apt_jax.config import HParams, check_hparams
-from apt_jax.plugin import Metrics
 from apt_jax.task_space import task_struct
 from apt_jax.trainer import Clock, Trainer, TrainState
 from apt_jax.turns import Turns
 
 Layout = Literal["auto", "vmap", "map"]
+
+LaneMetrics = dict[str, Float[Array, "L"]]
 
 
 class Program(NamedTuple):
@@ -46,7 +47,7 @@ class Program(NamedTuple):
 
     init: Callable[[Key[Array, "L"], Any, HParams], TrainState]
     warmup: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock]]
-    chunk: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock, Metrics]]
+    chunk: Callable[[TrainState, Clock, HParams], tuple[TrainState, Clock, LaneMetrics]]
 
 
 def stack_hparams(hparams: Sequence[HParams]) -> HParams:
@@ -157,7 +158,7 @@ def make_program(
         return warmup(states, clock, pad(hparams))
 
     @partial(jax.jit, donate_argnums=0)
-    def chunk_all(states: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock, Metrics]:
+    def chunk_all(states: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock, LaneMetrics]:
         return chunk(states, clock, pad(hparams))
 
     return Program(init_all, warmup_all, chunk_all)

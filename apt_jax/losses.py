@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Integer
 
 
 def td_target(
@@ -27,7 +27,7 @@ def td_target(
     return reward + discount * jnp.clip(bootstrap, low, high)
 
 
-def td_errors(q: Float[Array, "B A"], action: Int[Array, "B"], target: Float[Array, "B"]) -> Float[Array, "B"]:
+def td_errors(q: Float[Array, "B A"], action: Integer[Array, "B"], target: Float[Array, "B"]) -> Float[Array, "B"]:
     """Target minus the value of the action taken."""
     return target - jnp.take_along_axis(q, action[:, None].astype(jnp.int32), axis=-1)[:, 0]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, Float, Int, Key
 
@@ -12,6 +12,7 @@ from apt_jax.replay import Replay
 Metrics = dict[str, Float[Array, ""]]
 
 
+@runtime_checkable
 class UpdateFn(Protocol):
     """`update(state, key, replay, iteration, hparams) -> (state, metrics)`: one round of learning; consumes `key`.
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Integer, Key
 
 from apt_jax import draws
 from apt_jax.specs import Obs, Params, Spec, obs_struct, param_struct, zeros_like
@@ -28,7 +28,7 @@ class Transition(NamedTuple):
     """
 
     obs: Obs
-    action: Int[Array, "..."]
+    action: Integer[Array, "..."]
     reward: Float[Array, "..."]
     next_obs: Obs
     terminated: Bool[Array, "..."]
@@ -44,7 +44,7 @@ class Batch(NamedTuple):
     """
 
     obs: Obs
-    action: Int[Array, "..."]
+    action: Integer[Array, "..."]
     reward: Float[Array, "..."]
     next_obs: Obs
     discount: Float[Array, "..."]

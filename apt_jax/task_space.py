@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Integer, Key
 
 from apt_jax import draws
 from apt_jax.specs import Obs, Params, Spec, Vector, param_struct
@@ -28,6 +28,7 @@ class StepOutput(NamedTuple):
     success: Bool[Array, ""]
 
 
+@runtime_checkable
 class TaskSpace(Protocol):
     """A parameterised family of tasks sharing observations, actions and horizon (paper, Sec. 3.1).
 
@@ -60,7 +61,7 @@ class TaskSpace(Protocol):
         """An initial state of a task and its observation; consumes `key`."""
         ...
 
-    def step(self, state: Any, action: Int[Array, ""], task: Any) -> StepOutput:
+    def step(self, state: Any, action: Integer[Array, ""], task: Any) -> StepOutput:
         """One step with an action in [0, num_actions)."""
         ...
 

@@ -24,13 +24,13 @@ class Turns:
     went in, the groups' results, and these joined.
 
     Attributes:
-      function: jitted, of arrays with leaves [G, ...]; `lower` and `compile` do with it what they do with a jitted function.
+      function: jitted, of arrays with leaves [G, ...], or what `lower` and `compile` made of it.
       lanes: L.
       group: G.
       mesh: the devices that each group is spread over, on an axis "lane".
     """
 
-    function: Callable[..., Any]
+    function: Any
     lanes: int
     group: int
     mesh: Mesh
@@ -51,11 +51,11 @@ class Turns:
 
     def lower(self, *args: Any) -> Turns:
         """As of a jitted function."""
-        return dataclasses.replace(self, function=self.function.lower(*self._take(0, args)))  # type: ignore[attr-defined]
+        return dataclasses.replace(self, function=self.function.lower(*self._take(0, args)))
 
     def compile(self) -> Turns:
         """As of a lowered one."""
-        return dataclasses.replace(self, function=self.function.compile())  # type: ignore[attr-defined]
+        return dataclasses.replace(self, function=self.function.compile())
 
     def _take(self, start: int, args: tuple[Any, ...]) -> tuple[Any, ...]:
         """The arguments of the group that begins with lane `start`, on its devices; the very last lane fills the last group."""

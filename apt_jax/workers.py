@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Integer, Key
 
 from apt_jax.replay import Episode, Transition
 from apt_jax.specs import Obs, Params, param_struct, zeros_like
@@ -67,7 +67,7 @@ def start(space: TaskSpace, assignment: Assignment, key: Key[Array, ""]) -> Work
 def step(
     space: TaskSpace,
     workers: Workers,
-    action: Int[Array, "S E"],
+    action: Integer[Array, "S E"],
     assignment: Assignment,
     iteration: Int[Array, ""],
     key: Key[Array, ""],

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -18,6 +18,7 @@ from apt_jax.task_space import TaskSpace
 from envs import grid_world, manipulation
 
 
+@runtime_checkable
 class BenchmarkSpace(TaskSpace, Protocol):
     """A task space that comes with target tasks and pictures.
 

@@ -3,20 +3,22 @@
 * two CPU devices in each process, so that sharding is exercised for real;
 * a key used twice is an error (`jax_debug_key_reuse`);
 * mixing dtypes or ranks implicitly is an error (strict promotion);
+* an argument or result that is not what its annotation says, shapes included, is an error (jaxtyping);
 * programs are compiled without LLVM's optimisations and by XLA's simpler emitters, which takes half the time: each runs a few
   times on small arrays, so compiling is what costs;
 * compiled programs are dropped now and then: every one holds memory maps, and a process that has too many dies.
 
 The settings are global rather than per test, so that module-scoped fixtures compile under them too.  A test that has to
-break one says so with `@pytest.mark.relaxed("dtype")` (any of "dtype", "rank", "keys"), and why.
+break one says so with `@pytest.mark.relaxed("dtype")` (any of "dtype", "rank", "keys", "types"), and why.
 """
 
 from __future__ import annotations
 
 import functools
 import os
+import pkgutil
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +28,14 @@ os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FAST_COMPILE}"
 
 import hypothesis
 import jax
+import jaxtyping
 import optax
 import pytest
+
+# Shapes and types of annotations hold.  Not those of `HParams`, whose numbers may be traced, or stacked for lanes.
+PACKAGE = Path(__file__).parents[1] / "apt_jax"
+CHECKED = [f"apt_jax.{module.name}" for module in pkgutil.iter_modules([str(PACKAGE)]) if module.name != "config"]
+jaxtyping.install_import_hook([*CHECKED, "envs"], "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
 import envs
 import experiments.examples.corridor
@@ -44,10 +52,19 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 hypothesis.settings.register_profile("strict", deadline=None, derandomize=True, database=None, max_examples=30)
 hypothesis.settings.load_profile("strict")
 
+
+@contextmanager
+def _unchecked() -> Iterator[None]:
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
 RELAXATIONS: dict[str, Callable[[], AbstractContextManager[Any]]] = {
     "dtype": lambda: jax.numpy_dtype_promotion("standard"),
     "rank": lambda: jax.numpy_rank_promotion("allow"),
     "keys": lambda: jax.debug_key_reuse(False),
+    "types": _unchecked,
 }
 
 

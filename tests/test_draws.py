@@ -20,7 +20,7 @@ def test_uniform_draws_the_numbers_of_jax(shape):
 
 def test_integers_are_even_below_their_bounds():
     bounds = np.array([1, 3, 10])
-    drawn = np.asarray(draws.integers(key(), (20_000, 3), bounds))
+    drawn = np.asarray(draws.integers(key(), (20_000, 3), jnp.array(bounds)))
     assert drawn.dtype == np.int32
     for numbers, bound in zip(drawn.T, bounds, strict=True):
         share = np.bincount(numbers, minlength=bound) / len(numbers)

@@ -165,7 +165,9 @@ class TestPush:
 
         task = table((30, 20))
         drive = Drive(at_rest(), 1, advance)
-        outcome = push(task, task.cans, task.present, can=BLUE, direction=RIGHT, arm=lambda place, ahead: drive)
+        outcome = push(
+            task, task.cans, task.present, can=jnp.int32(BLUE), direction=jnp.int32(RIGHT), arm=lambda place, ahead: drive
+        )
         assert (bool(outcome.fell), bool(outcome.hit)) == (True, False)
         np.testing.assert_allclose(outcome.position, [0.31, 0.20], atol=1e-6)
 

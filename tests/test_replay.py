@@ -17,7 +17,7 @@ sample_transitions = jax.jit(
     replay.sample_transitions, static_argnames=("batches", "batch_size", "n_step", "success_share", "horizon")
 )
 sample_rollouts = jax.jit(replay.sample_rollouts, static_argnames=("source", "batch_size", "steps", "recent"))
-recent_outcome = jax.jit(replay.recent_outcome, static_argnames=("source", "window"))
+recent_outcome = jax.jit(replay.recent_outcome, static_argnames=("source", "window", "since"))
 write = jax.jit(replay.write)
 
 SOURCES, ENVS, COLUMNS, SLOTS = 2, 3, 16, 8
@@ -126,7 +126,7 @@ def test_sampled_transitions_are_whole_recent_and_equally_shared(iterations):
 def test_a_share_of_transitions_is_drawn_from_successful_episodes():
     """Every one that is still whole is as likely as any other, whatever its length, and every step of it."""
     rings, finished = _written(41, seed=3)
-    longest = max(episode[2] for source in finished for episode in source[-SLOTS:])
+    longest = max(int(episode[2]) for source in finished for episode in source[-SLOTS:])
     batch = _sample_successes(rings, longest)
     for source in range(SOURCES):
         whole = [episode for episode in finished[source][-SLOTS:] if episode[1] > 40 - COLUMNS + longest]
@@ -141,7 +141,7 @@ def test_a_share_of_transitions_is_drawn_from_successful_episodes():
 
 def test_a_source_without_success_is_drawn_uniformly():
     rings, finished = _written(41, seed=3)
-    longest = max(episode[2] for source in finished for episode in source[-SLOTS:])
+    longest = max(int(episode[2]) for source in finished for episode in source[-SLOTS:])
     failed = rings.episodes.success.at[0].set(False)
     batch = _sample_successes(rings._replace(episodes=rings.episodes._replace(success=failed)), longest)
     assert len(np.unique(batch[:, 0, :24])) == COLUMNS * ENVS, "every step of the ring"

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import optax
 import pytest
 from jax.errors import KeyReuseError
+
+from apt_jax.losses import td_errors
 
 
 def draw_twice(key):
@@ -57,7 +60,15 @@ def test_mixed_ranks_are_an_error():
         jnp.ones((2, 3)) * jnp.ones(3)
 
 
-@pytest.mark.relaxed("dtype", "rank", "keys")
+@pytest.mark.parametrize(
+    ("q", "action"), [((3, 2), jnp.zeros(4, jnp.uint8)), ((2,), jnp.zeros(2, jnp.uint8)), ((3, 2), jnp.zeros(3))]
+)
+def test_what_an_annotation_excludes_is_an_error(q, action):
+    with pytest.raises(jaxtyping.TypeCheckError, match="parameter 'action'" if len(q) == 2 else "parameter 'q'"):
+        jax.eval_shape(td_errors, jnp.zeros(q), action, jnp.zeros(3))
+
+
+@pytest.mark.relaxed("dtype", "rank", "keys", "types")
 def test_relaxed_marker_allows_them():
     assert (jnp.arange(3) * jnp.ones((2, 3))).shape == (2, 3)
     draw_twice(jax.random.key(0))

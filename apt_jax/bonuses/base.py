@@ -6,11 +6,11 @@ only what cannot be recomputed later is noted down when it is made.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Integer, Key
 
 from apt_jax.config import Config, HParams
 from apt_jax.plugin import Metrics, UpdateFn
@@ -31,37 +31,42 @@ class Step(NamedTuple):
     begun: Any
 
 
+@runtime_checkable
 class Steps(Protocol):
     """Steps to be paid for, with any leading axes: a `Batch` or a `Transition`."""
 
     @property
     def obs(self) -> Obs: ...
     @property
-    def action(self) -> Int[Array, "..."]: ...
+    def action(self) -> Integer[Array, "..."]: ...
     @property
     def next_obs(self) -> Obs: ...
     @property
     def note(self) -> Any: ...
 
 
+@runtime_checkable
 class InitFn(Protocol):
     """`init(key, states, hparams) -> state`, for the environments' first states (leaves [S, E, ...]); consumes `key`."""
 
     def __call__(self, key: Key[Array, ""], states: Any, hparams: HParams) -> Any: ...
 
 
+@runtime_checkable
 class AnnotateFn(Protocol):
     """`annotate(state, step, hparams) -> (state, note)`: when steps are made; notes have leaves [S, E, ...]."""
 
     def __call__(self, state: Any, step: Step, hparams: HParams) -> tuple[Any, Any]: ...
 
 
+@runtime_checkable
 class RewardFn(Protocol):
     """`reward(state, batch, hparams) -> (reward, metrics)`: what to train on, the bonus added, for any leading axes."""
 
     def __call__(self, state: Any, batch: Batch, hparams: HParams) -> tuple[Float[Array, "..."], Metrics]: ...
 
 
+@runtime_checkable
 class ReturnRangeFn(Protocol):
     """`return_range(state, replay) -> (low, high)`: what next values are clipped to in the reward that is trained on."""
 
@@ -124,7 +129,7 @@ def pay(batch: Batch, bonus: Float[Array, "..."]) -> tuple[Float[Array, "..."], 
 
 def sample(
     space: TaskSpace, config: Config, replay: Replay, key: Key[Array, ""], iteration: Int[Array, ""]
-) -> tuple[Obs, Int[Array, "B"], Obs]:
+) -> tuple[Obs, Integer[Array, "B"], Obs]:
     """Observation, action and next observation of `model_batch_size` steps of all sources; consumes `key`."""
     batch = sample_transitions(
         replay,

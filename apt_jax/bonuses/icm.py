@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Int, Integer, Key
 
 from apt_jax.bonuses.base import Bonus, Step, Steps, Stream, leading, pay, sample
 from apt_jax.config import Config, HParams
@@ -80,7 +80,7 @@ def prediction_error(predicted: Float[Array, "*batch d"], embedding: Float[Array
 
 
 def losses(
-    logits: Float[Array, "B A"], action: Int[Array, "B"], *, predicted: Float[Array, "B d"], embedding: Float[Array, "B d"]
+    logits: Float[Array, "B A"], action: Integer[Array, "B"], *, predicted: Float[Array, "B d"], embedding: Float[Array, "B d"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Inverse loss (cross-entropy of the action) and forward loss."""
     inverse = optax.losses.softmax_cross_entropy_with_integer_labels(logits, action.astype(jnp.int32))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Int, Key
 
@@ -15,18 +15,21 @@ TARGET, GENERATED = 0, 1
 """Indices of the sources along the leading axis of replay and workers."""
 
 
+@runtime_checkable
 class InitFn(Protocol):
     """`init(key, hparams) -> state`: a pytree of arrays; consumes `key`."""
 
     def __call__(self, key: Key[Array, ""], hparams: HParams) -> Any: ...
 
 
+@runtime_checkable
 class ProposeFn(Protocol):
     """`propose(state, key, n, hparams) -> w`: `n` task parameters, leaves [n, ...]; consumes `key`."""
 
     def __call__(self, state: Any, key: Key[Array, ""], n: int, hparams: HParams) -> Params: ...
 
 
+@runtime_checkable
 class RefreshFn(Protocol):
     """`refresh(state, key, replay, iterations, hparams) -> state`: slow adaptation on the cadence `Config.refresh_every`.
 
@@ -39,6 +42,7 @@ class RefreshFn(Protocol):
     ) -> Any: ...
 
 
+@runtime_checkable
 class ReportFn(Protocol):
     """`report(state, rollouts, hparams) -> metrics`: judge the state on fresh tasks, played by the averaged policy with
     today's exploration (the online one collects).

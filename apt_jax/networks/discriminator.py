@@ -5,7 +5,7 @@ from __future__ import annotations
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Integer
 
 from apt_jax.networks.encoders import ENCODING_SIZE, Encoder, Head, observation_features
 from apt_jax.networks.layers import Dense
@@ -40,7 +40,7 @@ class Discriminator(nn.Module):
         return self.init_head(self.init_encoder(observation_features(self.obs_spec, obs))).squeeze(-1)
 
     def score_step(
-        self, obs: Obs, action: Int[Array, "*batch"], *, reward: Float[Array, "*batch"], next_obs: Obs
+        self, obs: Obs, action: Integer[Array, "*batch"], *, reward: Float[Array, "*batch"], next_obs: Obs
     ) -> Float[Array, "*batch"]:
         """Logit of the transition (s_t, a_t, r_t, s_{t+1})."""
         both = jax.tree.map(lambda now, after: jnp.stack([now, after]), obs, next_obs)
@@ -51,7 +51,7 @@ class Discriminator(nn.Module):
         return self.step_head(encoding).squeeze(-1)
 
     def __call__(
-        self, obs: Obs, action: Int[Array, "*batch"], *, reward: Float[Array, "*batch"], next_obs: Obs
+        self, obs: Obs, action: Integer[Array, "*batch"], *, reward: Float[Array, "*batch"], next_obs: Obs
     ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
         """Both logits of a first transition; `init` makes the parameters of both branches by it."""
         return self.score_init(obs), self.score_step(obs, action, reward=reward, next_obs=next_obs)

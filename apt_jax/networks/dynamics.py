@@ -5,7 +5,7 @@ from __future__ import annotations
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Integer
 
 from apt_jax.networks.encoders import MERGE_SIZE, Encoder, Head, observation_features
 from apt_jax.specs import Obs, Spec
@@ -38,12 +38,12 @@ class Dynamics(nn.Module):
         """Logits of the action between two states."""
         return self.inverse_head(jnp.concatenate([phi, next_phi], axis=-1))
 
-    def predict(self, phi: Float[Array, "*batch 128"], action: Int[Array, "*batch"]) -> Float[Array, "*batch 128"]:
+    def predict(self, phi: Float[Array, "*batch 128"], action: Integer[Array, "*batch"]) -> Float[Array, "*batch 128"]:
         """The embedding after an action."""
         return self.forward_head(jnp.concatenate([phi, jax.nn.one_hot(action, self.num_actions)], axis=-1))
 
     def __call__(
-        self, obs: Obs, action: Int[Array, "*batch"], next_obs: Obs, *, detach: bool
+        self, obs: Obs, action: Integer[Array, "*batch"], next_obs: Obs, *, detach: bool
     ) -> tuple[Float[Array, "*batch A"], Float[Array, "*batch 128"], Float[Array, "*batch 128"]]:
         """Action logits, predicted and true embedding of s'; `init` makes all parameters by it.
 

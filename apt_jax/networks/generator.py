@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from math import prod
 from typing import Any
@@ -116,7 +117,7 @@ class GridHead(nn.Module):
         x = self.norm(axis=(-3, -2, -1), bias_init=self._blank)(Conv(self.grid.categories, use_bias=False)(x))
         return nn.softmax(x)
 
-    def _blank(self, key: Key[Array, ""], shape: tuple[int, ...], dtype: Any = jnp.float32) -> Float[Array, "h w c"]:
+    def _blank(self, key: Key[Array, ""], shape: Sequence[int], dtype: Any = jnp.float32) -> Float[Array, "h w c"]:
         del key
         return jnp.zeros(shape, dtype).at[..., 0].set(self.blank_bias)
 

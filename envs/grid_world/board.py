@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Int32, UInt8
 
 INTERIOR = 8
@@ -45,7 +46,7 @@ class Task(NamedTuple):
     present: Bool[Array, "5"]
 
     @property
-    def tiles(self) -> UInt8[Array, "*batch 10 10"]:
+    def tiles(self) -> UInt8[Array | np.ndarray, "*batch 10 10"]:
         """Tile categories of the board, border included; of every board if tasks are stacked."""
         return self.padded[..., MARGIN:-MARGIN, MARGIN:-MARGIN]
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, Int32
+from jaxtyping import Array, Bool, Int32, Integer
 
 from apt_jax.task_space import StepOutput
 from envs.grid_world.board import DOORS, GOAL, KEYS, LAVA, MARGIN, START, WALL, Task
@@ -44,13 +44,13 @@ def initial_state() -> State:
     return State(jnp.array(START, jnp.int32), jnp.zeros(2, bool), jnp.zeros((), jnp.int32))
 
 
-def visible_objects(keys: Bool[Array, "2"], task: Task) -> Bool[Array, "5"]:
+def visible_objects(keys: Bool[Array | np.ndarray, "2"], task: Task) -> Bool[Array, "5"]:
     """Whether each object is on the board: a taken key is gone, and so is the door of its colour."""
     gone = jnp.concatenate([jnp.zeros(1, bool), keys, keys])
     return task.present & ~gone
 
 
-def step(state: State, action: Int[Array, ""], task: Task) -> StepOutput:
+def step(state: State, action: Integer[Array, ""], task: Task) -> StepOutput:
     """One move of the agent; `action` must lie in [0, 4).
 
     The agent enters empty floor, keys and the goal.  It stays where it is when it hits a wall, and also when the episode ends

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key, UInt8
+from jaxtyping import Array, Float, Int, Integer, Key, UInt8
 
 from apt_jax.specs import Obs, Params, Spec
 from apt_jax.task_space import StepOutput, sample_uniform
@@ -51,7 +51,7 @@ class Space:
         state = dynamics.initial_state()
         return state, observe(state.position, dynamics.visible_objects(state.keys, task), task)
 
-    def step(self, state: State, action: Int[Array, ""], task: Task) -> StepOutput:
+    def step(self, state: State, action: Integer[Array, ""], task: Task) -> StepOutput:
         """One move (0 up, 1 right, 2 down, 3 left); see `dynamics` for the rules."""
         return dynamics.step(state, action, task)
 

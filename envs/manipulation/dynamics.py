@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Float32, Int, Int32
+from jaxtyping import Array, Float, Float32, Int32, Integer
 
 from apt_jax.task_space import StepOutput
 from envs.manipulation.observation import observe
@@ -37,7 +37,7 @@ class State(NamedTuple):
     steps: Int32[Array, ""]
 
 
-def step(state: State, action: Int[Array, ""], task: Task, arm: Arm = tool) -> StepOutput:
+def step(state: State, action: Integer[Array, ""], task: Task, arm: Arm = tool) -> StepOutput:
     """One push by an arm; `action` in [0, 12) is the can times four plus the direction.
 
     The target in the goal when a push is over is success, whichever can was pushed.  A push during which a can falls or meets

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key, UInt8
+from jaxtyping import Array, Float, Int, Integer, Key, UInt8
 
 from apt_jax.specs import Obs, Params, Spec
 from apt_jax.task_space import StepOutput, sample_uniform
@@ -61,7 +61,7 @@ class Space:
         goal = task.goal + jax.random.uniform(key, (2,), minval=-self.goal_jitter, maxval=self.goal_jitter)
         return State(task.cans, goal, jnp.int32(0)), observe(task.cans, goal, task)
 
-    def step(self, state: State, action: Int[Array, ""], task: Task) -> StepOutput:
+    def step(self, state: State, action: Integer[Array, ""], task: Task) -> StepOutput:
         """One push: can `action // 4` in direction `action % 4` (see `DIRECTIONS`); see `dynamics` for the rules."""
         return dynamics.step(state, action, task, self._arm)
 
