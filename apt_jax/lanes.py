@@ -29,6 +29,7 @@ from apt_jax.turns import Turns
 Layout = Literal["auto", "vmap", "map"]
 
 LaneMetrics = dict[str, Float[Array, "L"]]
+"""`Metrics` of every lane, by name."""
 
 
 class Program(NamedTuple):
