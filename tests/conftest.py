@@ -56,8 +56,10 @@ hypothesis.settings.load_profile("strict")
 @contextmanager
 def _unchecked() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
+    try:
+        yield
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
 
 
 RELAXATIONS: dict[str, Callable[[], AbstractContextManager[Any]]] = {

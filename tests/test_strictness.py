@@ -72,6 +72,7 @@ def test_what_an_annotation_excludes_is_an_error(q, action):
 def test_relaxed_marker_allows_them():
     assert (jnp.arange(3) * jnp.ones((2, 3))).shape == (2, 3)
     draw_twice(jax.random.key(0))
+    assert td_errors(jnp.ones((3, 2)), jnp.zeros(3), jnp.zeros(3)).shape == (3,)
 
 
 def test_adam_runs_under_strict_promotion():

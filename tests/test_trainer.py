@@ -201,7 +201,7 @@ def test_a_head_start_that_is_no_number_is_refused():
             make_trainer(SPACE, config("apt_gen", blank_bias=value))
 
 
-@pytest.mark.relaxed("types")
+@pytest.mark.relaxed("types")  # such a layout is what its type excludes
 def test_a_layout_or_devices_that_there_are_not_are_refused():
     trainer = make_trainer(SPACE, CONFIG)
     with pytest.raises(ValueError, match="layout must be one of auto, vmap, map, got 'pmap'"):
