@@ -11,7 +11,8 @@ import pytest
 
 from apt_jax import replay as rp
 from apt_jax.bonuses import BONUSES, icm, ride, rnd
-from apt_jax.bonuses.base import Step, Stream
+from apt_jax.bonuses.base import Step
+from apt_jax.bonuses.learned import Stream
 from apt_jax.bonuses.moments import MOST, Moments
 from apt_jax.config import Config, HParams
 from apt_jax.lanes import make_program, stack_hparams
@@ -137,6 +138,11 @@ def played(bonus, space, places, rounds):
     return state
 
 
+def remembering(state, **memory):
+    """A bonus's state with parts of its memory replaced."""
+    return state._replace(memory=state.memory._replace(**memory))
+
+
 def test_rnd_pays_less_for_what_it_has_seen_and_nothing_once_the_target_is_learned():
     space, bonus = Lock(), BONUSES["rnd"](Lock(), CONFIG)
     # The features of place 9 are known to vary, its network input was hardly ever seen.
@@ -145,13 +151,13 @@ def test_rnd_pays_less_for_what_it_has_seen_and_nothing_once_the_target_is_learn
     steps = lock_steps([0] * 7, [*visited, 9]).transition
 
     def pay(state):
-        unit_scale = state._replace(scale=Moments.start(), features=after.features)
+        unit_scale = remembering(state, scale=Moments.start(), features=after.memory.features)
         batch = rp.Batch(steps.obs, steps.action, steps.reward, steps.next_obs, steps.reward)
         return np.asarray(bonus.reward(unit_scale, batch, HParams())[0])[0]
 
     assert (pay(after)[:6] < 0.1 * pay(before)[:6]).all()
     assert pay(after)[6] > 10 * pay(after)[:6].max()
-    for a, b in zip(jax.tree.leaves(before.target), jax.tree.leaves(after.target), strict=True):
+    for a, b in zip(jax.tree.leaves(before.memory.target), jax.tree.leaves(after.memory.target), strict=True):
         np.testing.assert_array_equal(a, b, err_msg="the target network must stay as it is")
 
 
@@ -160,10 +166,11 @@ def test_rnds_unit_is_of_what_a_predictor_that_learns_pays():
     state = bonus.init(jax.random.key(0), jnp.zeros((1, 3)), HParams())
     step = lock_steps([0, 1, 2], [1, 2, 3])
     warm, _ = bonus.annotate(state, step, HParams())
+    state, warm = state.memory, warm.memory
     for a, b in zip((state.filtered, *state.scale), (warm.filtered, *warm.scale), strict=True):
         np.testing.assert_array_equal(a, b)
     assert (warm.features["place"].samples > state.features["place"].samples).all()
-    learned = played(bonus, space, [1, 2, 3], rounds=3)
+    learned = played(bonus, space, [1, 2, 3], rounds=3).memory
     np.testing.assert_allclose(learned.scale.samples, 2 * 3, atol=1e-3)
     assert (learned.filtered > 0).all()
 
@@ -181,7 +188,7 @@ def test_rnd_pays_nothing_where_predictor_and_target_agree(monkeypatch):
     steps = lock_steps([0, 1, 2], [1, 2, 3]).transition
     batch = rp.Batch(steps.obs, steps.action, steps.reward + 0.25, steps.next_obs, steps.reward)
     assert (bonus.reward(state, batch, HParams())[0] > 0.25).any()
-    reward, metrics = bonus.reward(state._replace(predictor=state.target), batch, HParams())
+    reward, metrics = bonus.reward(state._replace(params=state.memory.target), batch, HParams())
     np.testing.assert_array_equal(reward, np.full((1, 3), 0.25))
     assert metrics["intrinsic_reward"] == 0
     np.testing.assert_allclose(metrics["extrinsic_reward"], 0.25)
@@ -229,9 +236,9 @@ def test_rnds_unit_waits_for_bonuses_to_deviate():
     steps = lock_steps([0], [1]).transition
     batch = rp.Batch(steps.obs, steps.action, steps.reward, steps.next_obs, steps.reward)
     fresh = bonus.reward(state, batch, HParams())[0]
-    seen = state._replace(scale=state.scale.extend(jnp.ones(1)))
+    seen = remembering(state, scale=state.memory.scale.extend(jnp.ones(1)))
     np.testing.assert_allclose(bonus.reward(seen, batch, HParams())[0], fresh)
-    many = state._replace(scale=state.scale.extend(jnp.array([1.0, 5.0] * 10)))
+    many = remembering(state, scale=state.memory.scale.extend(jnp.array([1.0, 5.0] * 10)))
     np.testing.assert_allclose(bonus.reward(many, batch, HParams())[0], fresh / 2.0, rtol=1e-3)
 
 

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Integer, Key
+from jaxtyping import Array, Float, Integer, Key
 
-from apt_jax.config import Config, HParams
+from apt_jax.config import HParams
 from apt_jax.plugin import Metrics, UpdateFn
-from apt_jax.replay import Batch, Replay, Transition, sample_transitions
+from apt_jax.replay import Batch, Replay, Transition
 from apt_jax.specs import Obs
-from apt_jax.task_space import TaskSpace
 
 
 class Step(NamedTuple):
@@ -85,68 +82,3 @@ class Bonus(NamedTuple):
     reward: RewardFn
     update: UpdateFn
     return_range: ReturnRangeFn
-
-
-class Stream(NamedTuple):
-    """Episodic returns in the reward that is trained on, as it was when the steps were made: what the next-Q clip needs.
-
-    Attributes:
-      episode_return: of the current episodes, bonus included; -inf in those that began before learning did: what an untrained
-        network pays would raise `highest` for ever.
-      highest: of the finished episodes, -inf before the first that counts.
-    """
-
-    episode_return: Float[Array, "S E"]
-    highest: Float[Array, ""]
-
-    @classmethod
-    def start(cls, shape: tuple[int, int]) -> Stream:
-        """Before the first step of S x E environments."""
-        return cls(jnp.full(shape, -jnp.inf), jnp.float32(-jnp.inf))
-
-    def step(self, reward: Float[Array, "S E"], done: Bool[Array, "S E"], *, learning: Bool[Array, ""]) -> Stream:
-        """After a step that paid `reward`, bonus included; `learning` says whether an episode that begins after it counts."""
-        episode_return = self.episode_return + reward
-        highest = jnp.max(episode_return, initial=-jnp.inf, where=done)
-        fresh = jnp.where(learning, 0.0, -jnp.inf)
-        return Stream(jnp.where(done, fresh, episode_return), jnp.maximum(self.highest, highest))
-
-    def bounds(self, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """What the next values are clipped to: above by `highest`, unbounded before the first episode that counts.
-
-        Not below what the environment paid for any episode, the warm-up's too, since a bonus is never negative.  Below by the
-        lowest of these, since a discounted value may lie below every undiscounted return with bonuses in it.
-        """
-        low, paid = replay.returns.bounds()
-        return low, jnp.where(jnp.isneginf(self.highest), jnp.inf, jnp.maximum(self.highest, paid))
-
-
-def pay(batch: Batch, bonus: Float[Array, "..."]) -> tuple[Float[Array, "..."], Metrics]:
-    """Both rewards together, and each alone as a metric."""
-    metrics = {"extrinsic_reward": jnp.mean(batch.reward), "intrinsic_reward": jnp.mean(bonus)}
-    return batch.reward + bonus, metrics
-
-
-def sample(
-    space: TaskSpace, config: Config, replay: Replay, key: Key[Array, ""], iteration: Int[Array, ""]
-) -> tuple[Obs, Integer[Array, "B"], Obs]:
-    """Observation, action and next observation of `model_batch_size` steps of all sources; consumes `key`."""
-    batch = sample_transitions(
-        replay,
-        key,
-        iteration,
-        batches=1,
-        batch_size=config.model_batch_size,
-        n_step=1,
-        gamma=1.0,
-        success_share=0.0,
-        horizon=space.horizon,
-    )
-    obs, next_obs = ({name: block[0] for name, block in side.items()} for side in (batch.obs, batch.next_obs))
-    return obs, batch.action[0], next_obs
-
-
-def leading(states: Any) -> tuple[int, int]:
-    """Sources and environments of states with leaves [S, E, ...]."""
-    sources, envs = jax.tree.leaves(states)[0].shape[:2]
-    return sources, envs

@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, Integer, Key
+from jaxtyping import Array, Bool, Float, Integer, Key
 
-from apt_jax.bonuses.base import Bonus, Step, Steps, Stream, leading, pay, sample
+from apt_jax.bonuses.base import Bonus, Step, Steps
+from apt_jax.bonuses.learned import Moves, learned
 from apt_jax.config import Config, HParams
-from apt_jax.descent import ADAM, adam_step, has_learned
 from apt_jax.networks import Dynamics
 from apt_jax.networks.apply import apply
 from apt_jax.plugin import Metrics
-from apt_jax.replay import Batch, Replay
 from apt_jax.specs import obs_struct, zeros_like
 from apt_jax.task_space import TaskSpace
-
-
-class IcmState(NamedTuple):
-    """The dynamics model, its optimiser, and the returns it has led to."""
-
-    params: Any
-    opt_state: Any
-    stream: Stream
 
 
 def make(space: TaskSpace, config: Config) -> Bonus:
@@ -36,42 +26,27 @@ def make(space: TaskSpace, config: Config) -> Bonus:
     """
     network = Dynamics(space.obs_spec, space.num_actions)
 
-    def init(key: Key[Array, ""], states: Any, hparams: HParams) -> IcmState:
-        del hparams
+    def init(key: Key[Array, ""], states: Any) -> tuple[Any, Any]:
+        del states
         obs = zeros_like(obs_struct(space.obs_spec))
-        params = network.init(key, obs, jnp.int32(0), obs, detach=True)
-        return IcmState(params, ADAM.init(params), Stream.start(leading(states)))
+        return network.init(key, obs, jnp.int32(0), obs, detach=True), ()
 
-    def bonus(state: IcmState, steps: Steps, hparams: HParams) -> Float[Array, "..."]:
-        _, predicted, embedding = apply(network, state.params, steps.obs, steps.action, steps.next_obs, detach=True)
+    def observe(params: Any, memory: Any, step: Step, learning: Bool[Array, ""]) -> tuple[Any, Any]:
+        del params, step, learning
+        return memory, ()
+
+    def price(params: Any, memory: Any, steps: Steps, hparams: HParams) -> Float[Array, "..."]:
+        del memory
+        _, predicted, embedding = apply(network, params, steps.obs, steps.action, steps.next_obs, detach=True)
         return hparams.icm_scale * prediction_error(predicted, embedding)
 
-    def annotate(state: IcmState, step: Step, hparams: HParams) -> tuple[IcmState, Any]:
-        paid = step.transition.reward + bonus(state, step.transition, hparams)
-        stream = state.stream.step(paid, step.transition.done, learning=has_learned(state.opt_state))
-        return state._replace(stream=stream), ()
+    def loss(params: Any, memory: Any, moves: Moves) -> tuple[Float[Array, ""], Metrics]:
+        del memory
+        logits, predicted, embedding = apply(network, params, *moves, detach=True)
+        inverse, forward = losses(logits, moves.action, predicted=predicted, embedding=embedding)
+        return inverse + forward, {"icm_inverse_loss": inverse, "icm_forward_loss": forward}
 
-    def reward(state: IcmState, batch: Batch, hparams: HParams) -> tuple[Float[Array, "..."], Metrics]:
-        return pay(batch, bonus(state, batch, hparams))
-
-    def update(
-        state: IcmState, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
-    ) -> tuple[IcmState, Metrics]:
-        obs, action, next_obs = sample(space, config, replay, key, iteration)
-
-        def loss(params: Any) -> tuple[Float[Array, ""], Metrics]:
-            logits, predicted, embedding = apply(network, params, obs, action, next_obs, detach=True)
-            inverse, forward = losses(logits, action, predicted=predicted, embedding=embedding)
-            return inverse + forward, {"icm_inverse_loss": inverse, "icm_forward_loss": forward}
-
-        grads, metrics = jax.grad(loss, has_aux=True)(state.params)
-        params, opt_state = adam_step(state.params, state.opt_state, grads, hparams.bonus_learning_rate)
-        return IcmState(params, opt_state, state.stream), metrics
-
-    def return_range(state: IcmState, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        return state.stream.bounds(replay)
-
-    return Bonus((), init, annotate, reward, update, return_range)
+    return learned(space, config, note=(), init=init, observe=observe, price=price, loss=loss)
 
 
 def prediction_error(predicted: Float[Array, "*batch d"], embedding: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:

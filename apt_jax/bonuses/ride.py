@@ -9,14 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from apt_jax.bonuses.base import Bonus, Step, Steps, Stream, leading, pay, sample
+from apt_jax.bonuses.base import Bonus, Step, Steps
 from apt_jax.bonuses.icm import losses
+from apt_jax.bonuses.learned import Moves, learned
 from apt_jax.config import Config, HParams
-from apt_jax.descent import ADAM, adam_step, has_learned
 from apt_jax.networks import Dynamics
 from apt_jax.networks.apply import apply
 from apt_jax.plugin import Metrics
-from apt_jax.replay import Batch, Replay
 from apt_jax.specs import obs_struct, zeros_like
 from apt_jax.task_space import TaskSpace, over_environments
 
@@ -40,15 +39,6 @@ class Visits(NamedTuple):
     visited: Int[Array, ""]
 
 
-class RideState(NamedTuple):
-    """The dynamics model, its optimiser, the visits of every environment, and the returns it has led to."""
-
-    params: Any
-    opt_state: Any
-    visits: Visits
-    stream: Stream
-
-
 def make(space: TaskSpace, config: Config) -> Bonus:
     """Distance that an action moves the embedding, over the root of the visits of where it led, times `HParams.ride_scale`.
 
@@ -57,48 +47,31 @@ def make(space: TaskSpace, config: Config) -> Bonus:
     network = Dynamics(space.obs_spec, space.num_actions)
     fingerprint = over_environments(space.fingerprint)
 
-    def init(key: Key[Array, ""], states: Any, hparams: HParams) -> RideState:
-        del hparams
+    def init(key: Key[Array, ""], states: Any) -> tuple[Any, Visits]:
         obs = zeros_like(obs_struct(space.obs_spec))
         params = network.init(key, obs, jnp.int32(0), obs, detach=False)
-        visits = over_environments(partial(start_episode, horizon=space.horizon))(fingerprint(states))
-        return RideState(params, ADAM.init(params), visits, Stream.start(leading(states)))
+        return params, over_environments(partial(start_episode, horizon=space.horizon))(fingerprint(states))
 
-    def bonus(state: RideState, steps: Steps, hparams: HParams) -> Float[Array, "..."]:
-        phi, next_phi = (apply(network, state.params, obs, method="embed") for obs in (steps.obs, steps.next_obs))
+    def observe(params: Any, memory: Visits, step: Step, learning: Bool[Array, ""]) -> tuple[Visits, Float[Array, "S E"]]:
+        del params, learning
+        done, begun = step.transition.done, fingerprint(step.begun)
+        visits, note = over_environments(visit)(memory, fingerprint(step.state), done=done, begun=begun)
+        return visits, note
+
+    def price(params: Any, memory: Visits, steps: Steps, hparams: HParams) -> Float[Array, "..."]:
+        del memory
+        phi, next_phi = (apply(network, params, obs, method="embed") for obs in (steps.obs, steps.next_obs))
         return hparams.ride_scale * impact(phi, next_phi) * steps.note
 
-    def annotate(state: RideState, step: Step, hparams: HParams) -> tuple[RideState, Float[Array, "S E"]]:
-        done, begun = step.transition.done, fingerprint(step.begun)
-        visits, note = over_environments(visit)(state.visits, fingerprint(step.state), done=done, begun=begun)
-        paid = step.transition.reward + bonus(state, step.transition._replace(note=note), hparams)
-        stream = state.stream.step(paid, done, learning=has_learned(state.opt_state))
-        return state._replace(visits=visits, stream=stream), note
+    def loss(params: Any, memory: Visits, moves: Moves) -> tuple[Float[Array, ""], Metrics]:
+        del memory
+        logits, predicted, embedding = apply(network, params, *moves, detach=False)
+        inverse, forward = losses(logits, moves.action, predicted=predicted, embedding=embedding)
+        total = INVERSE_WEIGHT * inverse + FORWARD_WEIGHT * forward
+        return total, {"ride_inverse_loss": inverse, "ride_forward_loss": forward}
 
-    def reward(state: RideState, batch: Batch, hparams: HParams) -> tuple[Float[Array, "..."], Metrics]:
-        return pay(batch, bonus(state, batch, hparams))
-
-    def update(
-        state: RideState, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
-    ) -> tuple[RideState, Metrics]:
-        obs, action, next_obs = sample(space, config, replay, key, iteration)
-
-        def loss(params: Any) -> tuple[Float[Array, ""], Metrics]:
-            logits, predicted, embedding = apply(network, params, obs, action, next_obs, detach=False)
-            inverse, forward = losses(logits, action, predicted=predicted, embedding=embedding)
-            return INVERSE_WEIGHT * inverse + FORWARD_WEIGHT * forward, {
-                "ride_inverse_loss": inverse,
-                "ride_forward_loss": forward,
-            }
-
-        grads, metrics = jax.grad(loss, has_aux=True)(state.params)
-        params, opt_state = adam_step(state.params, state.opt_state, grads, hparams.bonus_learning_rate)
-        return state._replace(params=params, opt_state=opt_state), metrics
-
-    def return_range(state: RideState, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        return state.stream.bounds(replay)
-
-    return Bonus(jax.ShapeDtypeStruct((), jnp.float32), init, annotate, reward, update, return_range)
+    note = jax.ShapeDtypeStruct((), jnp.float32)
+    return learned(space, config, note=note, init=init, observe=observe, price=price, loss=loss)
 
 
 def impact(phi: Float[Array, "*batch d"], next_phi: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:

@@ -7,17 +7,16 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Key
 
-from apt_jax.bonuses.base import Bonus, Step, Steps, Stream, leading, pay, sample
+from apt_jax.bonuses.base import Bonus, Step, Steps
+from apt_jax.bonuses.learned import Moves, leading, learned
 from apt_jax.bonuses.moments import Moments
 from apt_jax.config import Config, HParams
-from apt_jax.descent import ADAM, adam_step, has_learned
 from apt_jax.networks import Distillation
 from apt_jax.networks.apply import apply
 from apt_jax.networks.encoders import Features, observation_features
 from apt_jax.plugin import Metrics
-from apt_jax.replay import Batch, Replay
 from apt_jax.specs import Obs, obs_struct, zeros_like
 from apt_jax.task_space import TaskSpace
 
@@ -34,20 +33,17 @@ EPSILON = 1e-8
 """Added to variances: some inputs never change."""
 
 
-class RndState(NamedTuple):
-    """Both networks, the predictor's optimiser, and running statistics, all of them taken when steps are made.
+class RndMemory(NamedTuple):
+    """The fixed network, and running statistics, all of them taken when steps are made.
 
     `filtered` is each environment's forward-filtered return of bonuses, across episodes, since the predictor's first update;
     `scale` holds its moments.  What an untrained predictor pays in the warm-up would outweigh all that it pays later.
     """
 
     target: Any
-    predictor: Any
-    opt_state: Any
     features: dict[str, Moments]
     filtered: Float[Array, "S E"]
     scale: Moments
-    stream: Stream
 
 
 def make(space: TaskSpace, config: Config) -> Bonus:
@@ -61,59 +57,41 @@ def make(space: TaskSpace, config: Config) -> Bonus:
     target_network = Distillation(space.obs_spec, deeper=False)
     predictor_network = Distillation(space.obs_spec, deeper=True)
 
-    def init(key: Key[Array, ""], states: Any, hparams: HParams) -> RndState:
-        del hparams
+    def init(key: Key[Array, ""], states: Any) -> tuple[Any, RndMemory]:
         key_target, key_predictor = jax.random.split(key)
         features = observation_features(space.obs_spec, zeros_like(obs_struct(space.obs_spec)))
-        predictor = predictor_network.init(key_predictor, features)
-        return RndState(
+        memory = RndMemory(
             target=target_network.init(key_target, features),
-            predictor=predictor,
-            opt_state=ADAM.init(predictor),
             features={name: Moments.start(block.shape) for name, block in features.items()},
             filtered=jnp.zeros(leading(states)),
             scale=Moments.start(),
-            stream=Stream.start(leading(states)),
         )
+        return predictor_network.init(key_predictor, features), memory
 
-    def error(state: RndState, predictor: Any, next_obs: Obs) -> Float[Array, "..."]:
-        features = normalise(state.features, observation_features(space.obs_spec, next_obs))
-        wanted = jax.lax.stop_gradient(apply(target_network, state.target, features))
-        return jnp.mean((apply(predictor_network, predictor, features) - wanted) ** 2, axis=-1)
+    def error(params: Any, memory: RndMemory, next_obs: Obs) -> Float[Array, "..."]:
+        features = normalise(memory.features, observation_features(space.obs_spec, next_obs))
+        wanted = jax.lax.stop_gradient(apply(target_network, memory.target, features))
+        return jnp.mean((apply(predictor_network, params, features) - wanted) ** 2, axis=-1)
 
-    def bonus(state: RndState, steps: Steps, hparams: HParams) -> Float[Array, "..."]:
-        unit = jnp.where(state.scale.samples < FEW, 1.0, jnp.sqrt(state.scale.variance + EPSILON))
-        return hparams.rnd_scale * error(state, state.predictor, steps.next_obs) / unit
-
-    def annotate(state: RndState, step: Step, hparams: HParams) -> tuple[RndState, Any]:
+    def observe(params: Any, memory: RndMemory, step: Step, learning: Bool[Array, ""]) -> tuple[RndMemory, Any]:
         features = observation_features(space.obs_spec, step.transition.next_obs)
         flat = {name: block.reshape(-1, *block.shape[2:]) for name, block in features.items()}
-        state = state._replace(features={name: state.features[name].extend(block) for name, block in flat.items()})
-        learning = has_learned(state.opt_state)
-        filtered = forward_filter(state.filtered, error(state, state.predictor, step.transition.next_obs))
+        memory = memory._replace(features={name: memory.features[name].extend(block) for name, block in flat.items()})
+        filtered = forward_filter(memory.filtered, error(params, memory, step.transition.next_obs))
         filtered, scale = jax.tree.map(
-            partial(jnp.where, learning), (filtered, state.scale.extend(filtered.reshape(-1))), (state.filtered, state.scale)
+            partial(jnp.where, learning), (filtered, memory.scale.extend(filtered.reshape(-1))), (memory.filtered, memory.scale)
         )
-        state = state._replace(filtered=filtered, scale=scale)
-        paid = step.transition.reward + bonus(state, step.transition, hparams)
-        stream = state.stream.step(paid, step.transition.done, learning=learning)
-        return state._replace(stream=stream), ()
+        return memory._replace(filtered=filtered, scale=scale), ()
 
-    def reward(state: RndState, batch: Batch, hparams: HParams) -> tuple[Float[Array, "..."], Metrics]:
-        return pay(batch, bonus(state, batch, hparams))
+    def price(params: Any, memory: RndMemory, steps: Steps, hparams: HParams) -> Float[Array, "..."]:
+        unit = jnp.where(memory.scale.samples < FEW, 1.0, jnp.sqrt(memory.scale.variance + EPSILON))
+        return hparams.rnd_scale * error(params, memory, steps.next_obs) / unit
 
-    def update(
-        state: RndState, key: Key[Array, ""], replay: Replay, iteration: Int[Array, ""], hparams: HParams
-    ) -> tuple[RndState, Metrics]:
-        _, _, next_obs = sample(space, config, replay, key, iteration)
-        loss, grads = jax.value_and_grad(lambda params: jnp.mean(error(state, params, next_obs)))(state.predictor)
-        predictor, opt_state = adam_step(state.predictor, state.opt_state, grads, hparams.bonus_learning_rate)
-        return state._replace(predictor=predictor, opt_state=opt_state), {"rnd_loss": loss}
+    def loss(params: Any, memory: RndMemory, moves: Moves) -> tuple[Float[Array, ""], Metrics]:
+        mean = jnp.mean(error(params, memory, moves.next_obs))
+        return mean, {"rnd_loss": mean}
 
-    def return_range(state: RndState, replay: Replay) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        return state.stream.bounds(replay)
-
-    return Bonus((), init, annotate, reward, update, return_range)
+    return learned(space, config, note=(), init=init, observe=observe, price=price, loss=loss)
 
 
 def forward_filter(filtered: Float[Array, "S E"], bonus: Float[Array, "S E"]) -> Float[Array, "S E"]:

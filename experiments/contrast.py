@@ -1,0 +1,87 @@
+"""Does one set of runs solve more seeds than another, or sooner: `python -m experiments.contrast --first DIR [DIR ...] --second DIR [DIR ...]`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from scipy import stats
+
+from experiments import markdown, report
+from experiments.errors import UsageError, exit_with
+
+HEADER = ("first", "second", "to steps", "solved", "p (solved)", "p (sooner)")
+
+DEALS = 200_000
+"""Ways to deal the seeds out that the test of times tries: all of them for two times ten, else a sample of this size."""
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """Test two sets of runs against each other, the seeds of each set together; nothing is corrected for several tests.
+
+    Two tests, both two-sided: Fisher's exact test of how many seeds are solved, and a permutation test of the Mann-Whitney
+    statistic of the evaluations at which they first are, where unsolved seeds share the last rank.  Target returns above 0.9
+    count as solved.
+
+    Attributes:
+      first: run directories.
+      second: run directories.
+      env_steps: what happened later does not count; by default the steps that all runs have made.
+    """
+
+    first: tuple[Path, ...]
+    second: tuple[Path, ...]
+    env_steps: int | None = None
+
+
+def main() -> int:
+    """The command line."""
+    contrast = tyro.cli(Contrast, prog="python -m experiments.contrast", description=__doc__)
+    print(markdown.table(HEADER, [cells(contrast.first, contrast.second, contrast.env_steps)]))
+    return 0
+
+
+def cells(first: Sequence[Path], second: Sequence[Path], env_steps: int | None = None) -> tuple[str, ...]:
+    """One line of the table.
+
+    Raises:
+      UsageError: a set without runs, or a run that has not come to `env_steps`.
+    """
+    if not first or not second:
+        raise UsageError("--first and --second need at least one directory each")
+    sets = [report.read(paths) for paths in (first, second)]
+    made = {name: int(steps[-1]) for runs in sets for name, (steps, _) in runs.items()}
+    until = min(made.values()) if env_steps is None else env_steps
+    if short := [f"{name} ({steps:,})" for name, steps in made.items() if steps < until]:
+        raise UsageError(f"--env-steps {until} must be at most what every run has made: {', '.join(short)}")
+    times = [solving_times(list(runs.values()), until) for runs in sets]
+    solved = " and ".join(f"{np.isfinite(own).sum()} of {own.size}" for own in times)
+    names = [", ".join(runs) for runs in sets]
+    return (*names, f"{until:,}", solved, f"{p_solved(*times):.2g}", f"{p_sooner(*times):.2g}")
+
+
+def solving_times(runs: Sequence[report.Run], until: int) -> Float[np.ndarray, "S"]:
+    """The first evaluation, in environment steps, at which each seed solved the target; infinite if none up to `until` did."""
+    firsts = [report.first_above(steps, values) for steps, curves in runs for values in curves["target_return_raw"]]
+    return np.array([np.inf if first is None or first > until else float(first) for first in firsts])
+
+
+def p_solved(first: Float[np.ndarray, "A"], second: Float[np.ndarray, "B"]) -> float:
+    """Fisher's exact test, two-sided, of how many of the times are finite."""
+    table = [[np.isfinite(times).sum(), np.isinf(times).sum()] for times in (first, second)]
+    return float(stats.fisher_exact(table).pvalue)
+
+
+def p_sooner(first: Float[np.ndarray, "A"], second: Float[np.ndarray, "B"]) -> float:
+    """Mann-Whitney test, two-sided, of which times are shorter, ties sharing their rank: exact, or sampled beyond `DEALS`."""
+    method = stats.PermutationMethod(n_resamples=DEALS, rng=np.random.default_rng(0))
+    return float(stats.mannwhitneyu(first, second, method=method).pvalue)
+
+
+if __name__ == "__main__":
+    exit_with(main)
