@@ -6,6 +6,8 @@ A table stands between two comments, of which the first says what it is made of,
     <!-- table: report FIGURE.png RUN [RUN ...] -->       `experiments.report` of runs; FIGURE.png shows their target return,
                                                           or with METRIC=NAME among the words that metric
     <!-- table: signs RUN [RUN ...] -->                   `experiments.signs` of runs
+    <!-- table: contrast STEPS A[+B...]:C[+D...] [...] -->  `experiments.contrast` of the runs A, B, ... with C, D, ... up to
+                                                          STEPS, a line for each pair of sets
     <!-- end of table -->
 """
 
@@ -19,7 +21,7 @@ from pathlib import Path
 
 import tyro
 
-from experiments import plots, report, signs
+from experiments import contrast, markdown, plots, report, signs
 from experiments.errors import UsageError, exit_with
 
 END = "<!-- end of table -->"
@@ -114,7 +116,20 @@ def _signs(names: Sequence[str], results: Path) -> str:
     return signs.table([results / run for run in names])
 
 
-TABLES: Mapping[str, Callable[[Sequence[str], Path], str]] = {"benchmark": _benchmark, "report": _report, "signs": _signs}
+def _contrast(names: Sequence[str], results: Path) -> str:
+    steps, *pairs = names
+    if not steps.isdecimal() or not pairs or any(pair.count(":") != 1 for pair in pairs):
+        raise UsageError(f"a contrast reads STEPS A[+B...]:C[+D...], got {' '.join(names)}")
+    sets = [[[results / run for run in side.split("+")] for side in pair.split(":")] for pair in pairs]
+    return markdown.table(contrast.HEADER, [contrast.cells(first, second, int(steps)) for first, second in sets])
+
+
+TABLES: Mapping[str, Callable[[Sequence[str], Path], str]] = {
+    "benchmark": _benchmark,
+    "contrast": _contrast,
+    "report": _report,
+    "signs": _signs,
+}
 """By the first word of a mark, the table of the other words."""
 
 
