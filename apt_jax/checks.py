@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from apt_jax.config import Config
-from apt_jax.specs import Vector, obs_struct, param_struct
+from apt_jax.networks.generator import NOISE_LAYERS
+from apt_jax.specs import Grid, Spec, Vector, obs_struct, param_struct
 from apt_jax.task_space import TaskSpace, task_struct
 
 
@@ -82,8 +83,8 @@ def check_space(space: TaskSpace) -> None:
     """Check that a space draws parameters, and begins with observations, of the shapes and dtypes of its specs.
 
     Raises:
-      ValueError: which method returns something else, and what is expected; or more actions, or categories to observe, than the
-        replay can store.
+      ValueError: which method returns something else, and what is expected; more actions, or categories to observe, than the
+        replay can store, or no step or action; names of modalities or descriptions that are taken.
     """
     sizes = {"num_actions": space.num_actions} | {
         f"obs_spec[{name!r}].categories": modality.categories
@@ -91,17 +92,37 @@ def check_space(space: TaskSpace) -> None:
         if not isinstance(modality, Vector)
     }
     for name, size in sizes.items():
-        if size > 256:
-            raise ValueError(f"{name} must be at most 256, got {size}")
+        if not 1 <= size <= 256:
+            raise ValueError(f"{name} must be in 1 to 256, got {size}")
+    if space.horizon < 1:
+        raise ValueError(f"horizon must be at least 1, got {space.horizon}")
+    _check_names("obs_spec", space.obs_spec)
+    _check_names("param_spec", space.param_spec, taken=NOISE_LAYERS)
     key = jax.eval_shape(lambda: jax.random.key(0))
+    task = task_struct(space)
     w = jax.eval_shape(space.sample_uniform, key)
-    _, obs = jax.eval_shape(space.reset, key, task_struct(space))
+    _, obs = jax.eval_shape(space.reset, key, task)
     for name, given, expected in (
         ("sample_uniform must return", w, param_struct(space.param_spec)),
         ("reset must return observations like", obs, obs_struct(space.obs_spec)),
     ):
         if _struct(given) != _struct(expected):
             raise ValueError(f"{space.name}.{name} {expected}, got {given}")
+    reported = {"return", "success", "logit"} | {
+        f"{kind}_{name}" for kind in ("entropy", "spread") for name in space.param_spec
+    }
+    if taken := reported & set(jax.eval_shape(space.describe, task, task)):
+        raise ValueError(f"{space.name}.describe must leave these names to the trainer: {', '.join(sorted(taken))}")
+
+
+def _check_names(what: str, spec: Spec, taken: frozenset[str] = frozenset()) -> None:
+    """Raises a ValueError for modalities that the layers of a network cannot be called by."""
+    taken |= {f"{name}_stack" for name, modality in spec.items() if isinstance(modality, Grid)}
+    for name in spec:
+        if not name.isidentifier() or name in taken:
+            raise ValueError(
+                f"{what} must name modalities like variables, and none {' or '.join(sorted(taken)) or 'twice'}, got {name!r}"
+            )
 
 
 def check_target(space: TaskSpace, target: Any) -> None:

@@ -43,11 +43,14 @@ def ranges(kind: type) -> dict[str, Range]:
 
 
 def check_ranges(numbers: HParams | Config) -> None:
-    """Check every field that has a range; for plain numbers, before they are traced.
+    """Check every field that has a range, and that sizes are whole; for plain numbers, before they are traced.
 
     Raises:
       ValueError: the field, its value, and what is allowed.
     """
+    for name, kind in get_type_hints(type(numbers)).items():
+        if kind is int and not isinstance(getattr(numbers, name), int):
+            raise ValueError(f"{name} must be a whole number, got {getattr(numbers, name)!r}")
     for name, (low, high, allowed) in ranges(type(numbers)).items():
         value = getattr(numbers, name)
         if not low <= value <= high:

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int, Key
 from apt_jax.config import HParams, check_hparams
 from apt_jax.task_space import task_struct
 from apt_jax.trainer import Clock, Trainer, TrainState
-from apt_jax.turns import Turns
+from apt_jax.turns import Turns, check_lanes
 
 Layout = Literal["auto", "vmap", "map"]
 
@@ -92,11 +92,13 @@ def make_program(
       devices: what to shard lanes over, by default every device of every process; no more are used than there are lanes.
 
     Raises:
-      ValueError: fewer than one lane, or fewer lanes than processes, or several processes with more lanes than there is room
-        for, or no CPU among JAX's platforms where lanes take turns; no devices, or an unknown layout.
+      ValueError: fewer than one lane, or room for none, or fewer lanes than processes, or several processes with more lanes
+        than there is room for, or no CPU among JAX's platforms where lanes take turns; no devices, or an unknown layout.
     """
     if lanes < 1:
         raise ValueError(f"a program needs at least one lane, got {lanes}")
+    if resident is not None and resident < 1:
+        raise ValueError(f"resident must be at least 1 lane per device, got {resident}")
     if layout not in get_args(Layout):
         raise ValueError(f"layout must be one of {', '.join(get_args(Layout))}, got {layout!r}")
     devices = jax.devices() if devices is None else devices
@@ -124,9 +126,7 @@ def make_program(
     padded = np.minimum(np.arange(lanes + -lanes % len(used)), lanes - 1)
 
     def pad(tree: Any) -> Any:
-        for leaf in jax.tree.leaves(tree):
-            if leaf.shape[:1] != (lanes,):  # traced, an index out of bounds would take the last one in silence
-                raise ValueError(f"a program of {lanes} lanes needs arrays [{lanes}, ...], got one of shape {leaf.shape}")
+        check_lanes(tree, lanes)
         return jax.tree.map(lambda x: x[padded], tree)
 
     def sharded(batched: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:

@@ -144,6 +144,7 @@ def reset(
     Returns:
       The learner to go on with, and whether it is fresh.
     """
-    now, before = (jnp.floor(count.astype(jnp.float32) / hparams.reset_every) for count in (steps, steps - every))
+    # Half a step more than a whole number of periods, and half less than the next: no rounding of the quotient moves a reset.
+    now, before = (jnp.floor((count.astype(jnp.float32) + 0.5) / hparams.reset_every) for count in (steps, steps - every))
     due = (now > before) & ~(kept.score > 0.0)
     return jax.tree.map(lambda new, old: jnp.where(due, new, old), init(network, key), state), due

@@ -36,6 +36,8 @@ class Vector:
             if not np.issubdtype(self.dtype, np.integer):
                 raise ValueError(f"Vector stores float32 or whole numbers, got {self}")
             held = np.iinfo(self.dtype)
+            if held.bits > 32:
+                raise ValueError(f"Vector stores at most 32 bits, as JAX does, got {self}")
             if not held.min <= self.low < self.high <= held.max:
                 raise ValueError(f"Vector needs a dtype that holds low and high, {held.min} to {held.max}, got {self}")
 

@@ -40,7 +40,7 @@ class TaskSpace(Protocol):
       obs_spec: modalities of an observation.
       param_spec: modalities of `w`.
       num_actions: discrete actions, at most 256.
-      horizon: steps after which an episode is over at the latest; the replay relies on `step` to end it.
+      horizon: steps after which an episode is over at the latest; where `step` does not end it, it is truncated.
     """
 
     name: str

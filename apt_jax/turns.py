@@ -36,7 +36,8 @@ class Turns:
     mesh: Mesh
 
     def __call__(self, *args: Any) -> Any:
-        """The results of all groups."""
+        """The results of all groups; raises a ValueError for another number of lanes (`check_lanes`)."""
+        self._check(args)
         host = NamedSharding(Mesh(np.array(jax.devices("cpu")[:1]), ("lane",)), PartitionSpec("lane"))
         groups = []
         for start in range(0, self.lanes, self.group):
@@ -51,11 +52,17 @@ class Turns:
 
     def lower(self, *args: Any) -> Turns:
         """As of a jitted function."""
+        self._check(args)
         return dataclasses.replace(self, function=self.function.lower(*self._take(0, args)))
 
     def compile(self) -> Turns:
         """As of a lowered one."""
         return dataclasses.replace(self, function=self.function.compile())
+
+    def _check(self, args: tuple[Any, ...]) -> None:
+        for arg in args:
+            if not isinstance(arg, Clock):
+                check_lanes(arg, self.lanes)
 
     def _take(self, start: int, args: tuple[Any, ...]) -> tuple[Any, ...]:
         """The arguments of the group that begins with lane `start`, on its devices; the very last lane fills the last group."""
@@ -68,6 +75,13 @@ class Turns:
             return jax.device_put(jax.tree.map(lambda x: x[rows], arg), lane)
 
         return tuple(map(take, args))
+
+
+def check_lanes(tree: Any, lanes: int) -> None:
+    """Raises a ValueError for a leaf without [lanes, ...]: JAX would repeat the last lane, or leave some out, in silence."""
+    for leaf in jax.tree.leaves(tree):
+        if np.shape(leaf)[:1] != (lanes,):
+            raise ValueError(f"a program of {lanes} lanes needs arrays [{lanes}, ...], got one of shape {np.shape(leaf)}")
 
 
 def _each(function: Callable[..., Any], *results: Any) -> Any:

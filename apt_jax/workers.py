@@ -74,7 +74,8 @@ def step(
     *,
     rollouts: int = 1,
 ) -> tuple[Workers, Transition, Any, Episode, Bool[Array, "S E"]]:
-    """Step every environment; where its episode ends, reset it into its assigned task; consumes `key`.
+    """Step every environment; where its episode ends, at the latest after `space.horizon` steps, reset it into its assigned
+    task; consumes `key`.
 
     Args:
       action: in [0, num_actions).
@@ -86,13 +87,16 @@ def step(
       they would end with this step, and which of them did.
 
     Raises:
-      ValueError: while traced, if the space's step returns observations or a reward of another shape or dtype.
+      ValueError: while traced, if the space's step returns a state, observations, a reward or flags of another shape or dtype.
     """
     out = over_environments(space.step)(workers.state, action, workers.task)
+    _check_like(out.state, workers.state, f"{space.name}.step must return a state like reset")
     _check_like(out.obs, workers.obs, f"{space.name}.step must return observations like reset")
     _check_like(out.reward, workers.episode_return, f"{space.name}.step must return a float32 reward")
-    done = out.terminated | out.truncated
+    for name in ("terminated", "truncated", "success"):
+        _check_like(getattr(out, name), workers.success, f"{space.name}.step must return {name} as a bool")
     length = workers.length + 1
+    done = out.terminated | out.truncated | (length >= space.horizon)
     episode_return = workers.episode_return + out.reward
     transition = Transition(workers.obs, action, out.reward, out.obs, out.terminated, done)
     env = jnp.broadcast_to(jnp.arange(done.shape[1], dtype=jnp.int32), done.shape)

@@ -11,7 +11,7 @@ import tyro
 from jaxtyping import Float
 from scipy import stats
 
-from experiments import markdown, report
+from experiments import markdown, plots, report
 from experiments.errors import UsageError, exit_with
 
 HEADER = ("first", "second", "to steps", "solved", "p (solved)", "p (sooner)")
@@ -65,7 +65,7 @@ def cells(first: Sequence[Path], second: Sequence[Path], env_steps: int | None =
     return (*names, f"{until:,}", solved, f"{p_solved(*times):.2g}", f"{p_sooner(*times):.2g}")
 
 
-def solving_times(runs: Sequence[report.Run], until: int) -> Float[np.ndarray, "S"]:
+def solving_times(runs: Sequence[plots.Run], until: int) -> Float[np.ndarray, "S"]:
     """The first evaluation, in environment steps, at which each seed solved the target; infinite if none up to `until` did."""
     firsts = [report.first_above(steps, values) for steps, curves in runs for values in curves["target_return_raw"]]
     return np.array([np.inf if first is None or first > until else float(first) for first in firsts])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from apt_jax import replay as rp
-from apt_jax.bonuses import BONUSES, icm, ride, rnd
+from apt_jax.bonuses import BONUSES, embedding, ride, rnd
 from apt_jax.bonuses.base import Step
 from apt_jax.bonuses.learned import Stream
 from apt_jax.bonuses.moments import MOST, Moments
@@ -26,7 +26,7 @@ CONFIG = Config(model_batch_size=32)
 
 
 def test_icm_oracle():
-    error = icm.prediction_error(jnp.ones(4), jnp.array([1.0, 2.0, 3.0, 4.0]))
+    error = embedding.prediction_error(jnp.ones(4), jnp.array([1.0, 2.0, 3.0, 4.0]))
     np.testing.assert_allclose(HParams().icm_scale * error, 0.07, rtol=1e-6)
 
 
@@ -38,8 +38,8 @@ def test_icms_encoder_learns_nothing_from_the_forward_loss():
     params = jax.jit(lambda key: network.init(key, obs, action, after, detach=True))(jax.random.key(0))
 
     def forward_loss(params, detach):
-        logits, predicted, embedding = network.apply(params, obs, action, after, detach=detach)
-        return icm.losses(logits, action, predicted=predicted, embedding=embedding)[1]
+        logits, predicted, phi = network.apply(params, obs, action, after, detach=detach)
+        return embedding.losses(logits, action, predicted=predicted, embedding=phi)[1]
 
     def touched(detach):
         grads = jax.jit(jax.grad(forward_loss), static_argnums=1)(params, detach)["params"]

@@ -17,7 +17,7 @@ from apt_jax.trainer import Clock, make_trainer
 from envs.manipulation import Space
 from envs.manipulation.push import GAP, STROKE, stroke
 from envs.manipulation.sawyer import pose, simulation
-from envs.manipulation.sawyer.course import STEPS, course, tip
+from envs.manipulation.sawyer.course import STROKE_STEPS, course, tip
 from envs.manipulation.sawyer.kinematics import Kinematics, arm_model, limits
 from envs.manipulation.sawyer.stage import mirror_places
 from envs.manipulation.sawyer.unfused import unfused
@@ -59,10 +59,10 @@ class TestCourse:
 
     def test_the_tip_keeps_to_the_stroke_all_over_the_table(self, courses):
         kinematics = Kinematics()
-        gone = np.asarray(jax.vmap(stroke)(jnp.arange(STEPS + 1, dtype=jnp.float32) * TIMESTEP)[0])
+        gone = np.asarray(jax.vmap(stroke)(jnp.arange(STROKE_STEPS + 1, dtype=jnp.float32) * TIMESTEP)[0])
         for place, ahead, joints in zip(*courses, strict=True):
             start = pose.behind(place.astype(float), ahead.astype(float))
-            for step in range(0, STEPS + 1, 20):
+            for step in range(0, STROKE_STEPS + 1, 20):
                 point, turn = kinematics.pose(joints[step])
                 np.testing.assert_allclose(point, start[:3] + gone[step] * np.append(ahead, 0), atol=5e-4)
                 np.testing.assert_allclose(turn, pose.rotation(start), atol=2e-3)
@@ -78,7 +78,7 @@ class TestScene:
         """In the frame of the push, where the base is elsewhere in each push."""
         scene = simulation.arm_scene()
         for place, ahead, joints in list(zip(*courses, strict=True))[::7]:
-            model = copy.copy(simulation.arm_model())
+            model = copy.copy(simulation.push_scene())
             stands = simulation.standing(scene, jnp.asarray(place), jnp.asarray(ahead)).model
             model.body_pos[:], model.body_quat[:] = stands.body_pos, stands.body_quat
             data = mujoco.MjData(model)
@@ -89,7 +89,7 @@ class TestScene:
             assert STROKE - CAN_RADIUS - 2 * TOOL_HALF[0] - GAP < x < STROKE - CAN_RADIUS - TOOL_HALF[0] + GAP
 
     def test_the_feet_come_first_and_nothing_else_touches(self):
-        model, feet = simulation.arm_model(), len(simulation.arm_scene().feet)
+        model, feet = simulation.push_scene(), len(simulation.arm_scene().feet)
         names = [model.geom(geom).name for geom in model.pair_geom2]
         assert names[:feet] == [f"foot{index}" for index in range(feet)]
         assert {model.geom(geom[feet]).name for geom in (model.pair_geom1, model.pair_geom2)} == {"side", "sawyer/tip"}
@@ -98,7 +98,7 @@ class TestScene:
 
     def test_it_is_the_robot_of_the_replay(self):
         """Masses, inertias, limits of position and of torque, link by link."""
-        ours, theirs = simulation.arm_model(), arm_model()
+        ours, theirs = simulation.push_scene(), arm_model()
         for index in range(7):
             name = f"right_l{index}"
             for field in ("mass", "inertia", "ipos", "iquat", "pos", "quat"):

@@ -76,7 +76,7 @@ class LearnedState(NamedTuple):
 
 
 @runtime_checkable
-class MakeFn(Protocol):
+class StartFn(Protocol):
     """`init(key, states) -> (params, memory)`, for the environments' first states (leaves [S, E, ...]); consumes `key`."""
 
     def __call__(self, key: Key[Array, ""], states: Any) -> tuple[Any, Any]: ...
@@ -104,7 +104,7 @@ class LossFn(Protocol):
 
 
 def learned(
-    space: TaskSpace, config: Config, *, note: Any, init: MakeFn, observe: ObserveFn, price: PriceFn, loss: LossFn
+    space: TaskSpace, config: Config, *, note: Any, init: StartFn, observe: ObserveFn, price: PriceFn, loss: LossFn
 ) -> Bonus:
     """The bonus `price`, whose `params` descend `loss` by Adam at `HParams.bonus_learning_rate`.
 

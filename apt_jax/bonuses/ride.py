@@ -10,13 +10,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from apt_jax.bonuses.base import Bonus, Step, Steps
-from apt_jax.bonuses.icm import losses
-from apt_jax.bonuses.learned import Moves, learned
+from apt_jax.bonuses.embedding import dynamics_loss, init_dynamics
+from apt_jax.bonuses.learned import learned
 from apt_jax.config import Config, HParams
 from apt_jax.networks import Dynamics
 from apt_jax.networks.apply import apply
-from apt_jax.plugin import Metrics
-from apt_jax.specs import obs_struct, zeros_like
 from apt_jax.task_space import TaskSpace, over_environments
 
 FORWARD_WEIGHT = 10.0
@@ -45,12 +43,12 @@ def make(space: TaskSpace, config: Config) -> Bonus:
     Visits are counted when the step is made and stored with it; the embedding is today's.
     """
     network = Dynamics(space.obs_spec, space.num_actions)
+    loss = dynamics_loss(network, "ride", inverse_weight=INVERSE_WEIGHT, forward_weight=FORWARD_WEIGHT, detach=False)
     fingerprint = over_environments(space.fingerprint)
 
     def init(key: Key[Array, ""], states: Any) -> tuple[Any, Visits]:
-        obs = zeros_like(obs_struct(space.obs_spec))
-        params = network.init(key, obs, jnp.int32(0), obs, detach=False)
-        return params, over_environments(partial(start_episode, horizon=space.horizon))(fingerprint(states))
+        visits = over_environments(partial(start_episode, horizon=space.horizon))(fingerprint(states))
+        return init_dynamics(network, key), visits
 
     def observe(params: Any, memory: Visits, step: Step, learning: Bool[Array, ""]) -> tuple[Visits, Float[Array, "S E"]]:
         del params, learning
@@ -62,13 +60,6 @@ def make(space: TaskSpace, config: Config) -> Bonus:
         del memory
         phi, next_phi = (apply(network, params, obs, method="embed") for obs in (steps.obs, steps.next_obs))
         return hparams.ride_scale * impact(phi, next_phi) * steps.note
-
-    def loss(params: Any, memory: Visits, moves: Moves) -> tuple[Float[Array, ""], Metrics]:
-        del memory
-        logits, predicted, embedding = apply(network, params, *moves, detach=False)
-        inverse, forward = losses(logits, moves.action, predicted=predicted, embedding=embedding)
-        total = INVERSE_WEIGHT * inverse + FORWARD_WEIGHT * forward
-        return total, {"ride_inverse_loss": inverse, "ride_forward_loss": forward}
 
     note = jax.ShapeDtypeStruct((), jnp.float32)
     return learned(space, config, note=note, init=init, observe=observe, price=price, loss=loss)

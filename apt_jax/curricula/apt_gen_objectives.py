@@ -106,10 +106,10 @@ def make_objectives(
         normalised, spectral = spectral_normalize(params, spectral, bound=hparams.spectral_bound)
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), target, generated)
         initial, transitions = judge(normalised, both)
-        logits = tuple(jnp.split(pooled(initial, transitions, both.length), 2))
-        judged = (initial, transitions) if config.judge_parts else (pooled(initial, transitions, both.length),)
+        logits = pooled(initial, transitions, both.length)
+        judged = (initial, transitions) if config.judge_parts else (logits,)
         loss = jnp.mean(jnp.stack([losses.discriminator_loss(*jnp.split(part, 2)) for part in judged]))
-        return loss, (logits, spectral)
+        return loss, (tuple(jnp.split(logits, 2)), spectral)
 
     def value_loss(ensemble: Any, w: Params, outcome: Float[Array, "B"]) -> tuple[Float[Array, ""], Any]:
         errors = evaluate(ensemble, w) - outcome[None]

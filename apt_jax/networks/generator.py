@@ -17,6 +17,9 @@ from apt_jax.specs import Grid, Params, Spec, Table, Vector
 
 OUTPUT_NORM = "output_norm"
 
+NOISE_LAYERS = frozenset({"noise", "noise_norm"})
+"""Names that no modality can have: `Generator` calls the layers common to all by them."""
+
 
 class Generator(nn.Module):
     """z [batch, noise_size] -> w, each modality [batch, ...].

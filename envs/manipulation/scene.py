@@ -89,7 +89,7 @@ def tool(**attributes: str) -> str:
     <body name="tool" pos="0 0 {TOOL_HEIGHT}">
       <joint name="tool" type="slide" axis="1 0 0"/>
       <inertial pos="0 0 0" mass="200" diaginertia="1 1 1"/>
-      <geom name="tool" type="box" size="{_numbers(TOOL_HALF)}" {extra}/>
+      <geom name="tool" type="box" size="{numbers(TOOL_HALF)}" {extra}/>
     </body>"""
 
 
@@ -98,7 +98,7 @@ def push_xml(*, with_tool: bool = True) -> str:
     silent = {"contype": "0", "conaffinity": "0"}
     off = " ".join(f'{name}="{value}"' for name, value in silent.items())
     spheres = [
-        f'<geom name="foot{i}" type="sphere" size="{FOOT_RADIUS}" pos="{_numbers(place)}" {off}/>'
+        f'<geom name="foot{i}" type="sphere" size="{FOOT_RADIUS}" pos="{numbers(place)}" {off}/>'
         for i, place in enumerate(feet())
     ]
     pairs = [f'<pair geom1="floor" geom2="foot{i}" condim="1" solref="{CONTACT}"/>' for i in range(len(spheres))]
@@ -169,5 +169,6 @@ def for_mjx(model: Any, step: Callable[[Any], Callable[..., Any]]) -> Model:
     return Model(jax.jit(step(mjx)), put, data, feet(), model.npair)
 
 
-def _numbers(values: Iterable[float]) -> str:
+def numbers(values: Iterable[float]) -> str:
+    """As an attribute of MuJoCo's XML has them."""
     return " ".join(f"{value:.9g}" for value in values)

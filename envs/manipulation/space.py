@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import jax
@@ -31,7 +32,8 @@ class Space:
       arm: what pushes the cans, a name of `arms.ARMS`.
 
     Raises:
-      ValueError: a wrong name of an arm, or `MUJOCO_GL` names a library that is missing.
+      ValueError: a wrong name of an arm, a `goal_jitter` that is negative or not finite, or `MUJOCO_GL` names a library that is
+        missing.
     """
 
     name: str = "manipulation"
@@ -44,6 +46,8 @@ class Space:
 
     def __init__(self, goal_jitter: float = 0.03, arm: str = "tool"):
         scene.check_drawing()
+        if not 0.0 <= goal_jitter < math.inf:
+            raise ValueError(f"goal_jitter must be finite and at least 0, got {goal_jitter}")
         self.goal_jitter, self.arm = goal_jitter, arm
         self.name = Space.name if arm == "tool" else f"{Space.name}_{arm}"
         self._arm = arms.arm(arm)

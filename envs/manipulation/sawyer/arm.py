@@ -10,10 +10,9 @@ the same file's collision shapes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
-from envs.manipulation.scene import TOOL_HALF
+from envs.manipulation.scene import TOOL_HALF, numbers
 from envs.manipulation.table import BLOCK, COLUMNS
 
 Vector = tuple[float, float, float]
@@ -161,7 +160,7 @@ def arm_xml() -> str:
   <compiler angle="radian" eulerseq="XYZ" autolimits="true"/>
   <default><geom contype="0" conaffinity="0"/></default>
   <worldbody>
-    <body name="base" pos="{_numbers(BASE)} 0" euler="0 0 {RIGHT_ANGLE}">
+    <body name="base" pos="{numbers(BASE)} 0" euler="0 0 {RIGHT_ANGLE}">
       <geom type="cylinder" fromto="0 0 0 0 0 0.08" size="0.08" rgba="{BLACK}"/>
       <geom type="cylinder" fromto="0 0 -0.6 0 0 0" size="0.11" rgba="{BLACK}"/>
       <geom type="box" pos="-0.02 0 {(-0.6 - HEIGHT) / 2}" size="0.3 0.3 {(HEIGHT - 0.6) / 2}" rgba="{BLACK}"/>
@@ -175,14 +174,14 @@ def arm_xml() -> str:
 def _link(index: int, inside: str) -> str:
     link, name = LINKS[index], f"right_l{index}"
     housings = [
-        f'<geom name="{name}_{part}" type="capsule" fromto="{_numbers((*start, *end))}" size="{radius}" '
+        f'<geom name="{name}_{part}" type="capsule" fromto="{numbers((*start, *end))}" size="{radius}" '
         f'rgba="{GREY if part else RED}"/>'
         for part, (start, end, radius) in enumerate(link.housings)
     ]
     return f"""
-    <body name="{name}" pos="{_numbers(link.pos)}" euler="{_numbers(link.rpy)}">
-      <inertial pos="{_numbers(link.center)}" mass="{link.mass}" fullinertia="{_numbers(link.inertia)}"/>
-      <joint name="right_j{index}" axis="0 0 1" range="{_numbers(link.limits)}"/>
+    <body name="{name}" pos="{numbers(link.pos)}" euler="{numbers(link.rpy)}">
+      <inertial pos="{numbers(link.center)}" mass="{link.mass}" fullinertia="{numbers(link.inertia)}"/>
+      <joint name="right_j{index}" axis="0 0 1" range="{numbers(link.limits)}"/>
       {"".join(housings)}
       {inside}
     </body>"""
@@ -193,7 +192,7 @@ def _head() -> str:
     inertia = (0.011833, 0.0082709, 0.0049661, -4.4669e-06, 4.9425e-05, 4.2124e-07)
     return f"""
     <body name="head" pos="0 0 0.2965">
-      <inertial pos="0.0053207 -2.6549e-05 0.1021" mass="1.5795" fullinertia="{_numbers(inertia)}"/>
+      <inertial pos="0.0053207 -2.6549e-05 0.1021" mass="1.5795" fullinertia="{numbers(inertia)}"/>
       <geom type="cylinder" fromto="0 0 0 0 0 0.1" size="0.03" rgba="{GREY}"/>
       <geom type="box" pos="0.015 0 0.105" size="0.014 0.125 0.075" rgba="{GREY}"/>
       <geom type="box" pos="0.03 0 0.105" size="0.001 0.12 0.07" rgba="{BLACK}"/>
@@ -209,10 +208,6 @@ def _tool() -> str:
       <inertial pos="0 0 {FLANGE + STICK / 3}" mass="{TOOL_MASS}" diaginertia="0.002 0.002 0.0001"/>
       <geom type="cylinder" fromto="0 0 {FLANGE} 0 0 {FLANGE + 0.06}" size="0.02" rgba="{BLACK}"/>
       <geom name="stick" type="cylinder" fromto="{ends}" size="{STICK_RADIUS}" rgba="{BLACK}" {solid}/>
-      <geom name="tip" type="box" pos="{BEHIND} 0 {tip}" size="{_numbers(TOOL_HALF)}" rgba="{BLACK}" {solid}/>
+      <geom name="tip" type="box" pos="{BEHIND} 0 {tip}" size="{numbers(TOOL_HALF)}" rgba="{BLACK}" {solid}/>
       <site name="tip" pos="{BEHIND} 0 {tip}" size="0.001" group="4"/>
     </body>"""
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return " ".join(f"{value:.9g}" for value in values)

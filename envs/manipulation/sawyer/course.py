@@ -22,7 +22,7 @@ APPROACH, SETTLE = 20, 10
 FOLLOW = 2
 """Iterations for a time step of the stroke."""
 
-STEPS = round(STROKE_SECONDS / TIMESTEP)
+STROKE_STEPS = round(STROKE_SECONDS / TIMESTEP)
 
 
 class Frames(NamedTuple):
@@ -88,7 +88,7 @@ def course(place: Float[Array, "2"], ahead: Float[Array, "2"]) -> Float[Array, "
         return joints, joints
 
     begin, _ = jax.lax.scan(come, seed, shares)
-    times = TIMESTEP * jnp.arange(1, STEPS + 1, dtype=jnp.float32)
+    times = TIMESTEP * jnp.arange(1, STROKE_STEPS + 1, dtype=jnp.float32)
     _, rows = jax.lax.scan(go, begin, jax.vmap(stroke)(times)[0])
     return jnp.concatenate([begin[None], rows])
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from envs.manipulation.push import Drive, Motion, Supported, at_rest, take_step
 from envs.manipulation.sawyer.arm import BASE, RIGHT_ANGLE, arm_xml
-from envs.manipulation.sawyer.course import STEPS, course
+from envs.manipulation.sawyer.course import STROKE_STEPS, course
 from envs.manipulation.sawyer.kinematics import JOINTS
 from envs.manipulation.sawyer.servo import wanted
 from envs.manipulation.sawyer.stage import PREFIX, mirror_places
@@ -40,7 +40,7 @@ def sawyer(place: Float[Array, "2"], ahead: Float[Array, "2"]) -> Drive:
     scene = standing(arm_scene(), seen, seen_ahead)
 
     def advance(motion: Motion, supported: Supported) -> Motion:
-        now = jnp.minimum(motion.steps, STEPS + 1)
+        now = jnp.minimum(motion.steps, STROKE_STEPS + 1)
         off, speed_off = joints[now] - motion.qpos[-JOINTS:], speeds[now] - motion.qvel[-JOINTS:]
         data = scene.data.replace(ctrl=wanted(off, speed_off, accelerations[now], RATE))
         return take_step(scene._replace(data=data), motion, supported)
@@ -52,11 +52,11 @@ def sawyer(place: Float[Array, "2"], ahead: Float[Array, "2"]) -> Drive:
 @functools.cache
 def arm_scene() -> Model:
     """The scene for MJX, whose `ctrl` are the accelerations wanted of the joints; made once, at first use."""
-    return for_mjx(arm_model(), lambda mjx: unfused(functools.partial(_step, mjx)))
+    return for_mjx(push_scene(), lambda mjx: unfused(functools.partial(_step, mjx)))
 
 
 @functools.cache
-def arm_model() -> mujoco.MjModel:
+def push_scene() -> mujoco.MjModel:
     """The scene: can, floor and the arm, of whose geoms only the tool's tip is there."""
     arm = mujoco.MjSpec.from_string(arm_xml())
     for geom in [geom for geom in arm.geoms if geom.name != "tip"]:
@@ -82,7 +82,7 @@ def standing(scene: Model, place: Float[Array, "2"], ahead: Float[Array, "2"]) -
     Args:
       place, ahead: as the robot sees them, in metres and a unit vector along x or y.
     """
-    index = arm_model().body(f"{PREFIX}base").id
+    index = push_scene().body(f"{PREFIX}base").id
     x, y = jnp.asarray(BASE, jnp.float32) - place
     zero = jnp.zeros(())
     point = jnp.stack([x * ahead[0] + y * ahead[1], y * ahead[0] - x * ahead[1], zero])
