@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import envs
+from envs.manipulation import Space
 from envs.manipulation.solver import solve
 from envs.manipulation.targets import DEMONSTRATIONS
 from tests.tables import BLUE, PIT, RIGHT, ROADBLOCK, SPACE, params, play, table
@@ -153,6 +154,12 @@ class TestTables:
         path.write_text(A.replace("can 13.8", "can x"))
         with pytest.raises(ValueError, match=re.escape("mine.txt: line 5, column 5: 'x' is no number")):
             envs.load_target_file("manipulation", path)
+
+
+@pytest.mark.parametrize("jitter", [-0.1, float("nan"), float("inf")])
+def test_a_jitter_that_is_no_length_is_refused(jitter):
+    with pytest.raises(ValueError, match="goal_jitter must be finite and at least 0, got"):
+        Space(goal_jitter=jitter)
 
 
 class TestDescriptions:

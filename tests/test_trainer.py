@@ -22,7 +22,7 @@ from apt_jax.descent import has_learned
 from apt_jax.evaluation import diversity
 from apt_jax.lanes import _spread, lane_bytes, make_program, room, stack_hparams, stack_targets
 from apt_jax.methods import METHODS, Method, parse_method
-from apt_jax.specs import Vector
+from apt_jax.specs import Grid, Vector
 from apt_jax.task_space import task_struct
 from apt_jax.trainer import Clock, make_trainer
 from experiments.examples.corridor import Corridor
@@ -189,6 +189,53 @@ def test_a_space_that_is_not_what_its_specs_say_is_refused():
         jax.eval_shape(make_program(trainer, 1).warmup, *lane_struct(trainer))
 
 
+@pytest.mark.relaxed("types")  # such a flag or state is what the protocol's types exclude
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda out: {"success": out.success.astype(jnp.int32)}, "corridor.step must return success as a bool"),
+        (lambda out: {"truncated": out.truncated.astype(jnp.float32)}, "corridor.step must return truncated as a bool"),
+        (lambda out: {"state": jax.tree.map(jnp.float32, out.state)}, "corridor.step must return a state like reset"),
+    ],
+)
+def test_a_step_of_other_flags_or_states_is_refused(change, words):
+    class Changing(Corridor):
+        def step(self, state, action, task):
+            out = super().step(state, action, task)
+            return out._replace(**change(out))
+
+    trainer = make_trainer(Changing(), CONFIG)
+    with pytest.raises(ValueError, match=words):
+        jax.eval_shape(make_program(trainer, 1).warmup, *lane_struct(trainer))
+
+
+@pytest.mark.parametrize(
+    ("attributes", "words"),
+    [
+        ({"num_actions": 0}, "num_actions must be in 1 to 256, got 0"),
+        ({"horizon": 0}, "horizon must be at least 1, got 0"),
+        ({"param_spec": {"noise": Vector(1, 0, 1)}}, "param_spec must name modalities like variables, .* got 'noise'"),
+        ({"param_spec": {"a/b": Vector(1, 0, 1)}}, "param_spec must name .* got 'a/b'"),
+        ({"obs_spec": {"tiles": Grid(2, 2, 2), "tiles_stack": Vector(1, 0, 1)}}, "none tiles_stack, got 'tiles_stack'"),
+        (
+            {"describe": lambda self, task, target: {"return": jnp.float32(0), "goal": jnp.float32(0)}},
+            "to the trainer: return$",
+        ),
+        ({"describe": lambda self, task, target: {"spread_goal": jnp.float32(0)}}, "to the trainer: spread_goal$"),
+    ],
+)
+def test_a_space_of_no_size_or_of_names_that_are_taken_is_refused(attributes, words):
+    with pytest.raises(ValueError, match=words):
+        make_trainer(type("Odd", (Corridor,), attributes)(), CONFIG)
+
+
+@pytest.mark.relaxed("types")  # sizes that are not whole are what their type excludes
+def test_sizes_that_are_not_whole_are_refused():
+    for changes in ({"n_step": 1.5}, {"replay_steps": 200.0}):
+        with pytest.raises(ValueError, match=f"{next(iter(changes))} must be a whole number, got"):
+            make_trainer(SPACE, config("dqn", **changes))
+
+
 def lane_struct(trainer):
     lanes = stack_hparams([HParams()])
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), 1))
@@ -208,6 +255,8 @@ def test_a_layout_or_devices_that_there_are_not_are_refused():
         make_program(trainer, 1, layout="pmap")
     with pytest.raises(ValueError, match="at least one device"):
         make_program(trainer, 1, devices=[])
+    with pytest.raises(ValueError, match="resident must be at least 1 lane per device, got 0"):
+        make_program(trainer, 3, resident=0)
 
 
 def test_64_bits_are_refused():
@@ -237,9 +286,31 @@ def test_a_space_may_compute_with_weak_dtypes():
 
 
 def test_a_vector_of_a_dtype_that_cannot_hold_it_is_refused():
-    for dtype, words in (("uint8", "holds low and high, 0 to 255"), ("float16", "float32 or whole numbers")):
+    for dtype, words in (
+        ("uint8", "holds low and high, 0 to 255"),
+        ("float16", "float32 or whole numbers"),
+        ("int64", "at most 32 bits"),
+    ):
         with pytest.raises(ValueError, match=words):
             Vector(1, 0, 300, dtype)
+
+
+def test_an_episode_is_truncated_at_the_horizon_by_a_space_that_forgets_to():
+    class Endless(Corridor):
+        def step(self, state, action, task):
+            out = super().step(state, action, task)
+            return out._replace(terminated=jnp.bool(False), truncated=jnp.bool(False))
+
+    space = Endless()
+    assignment = workers.assign(space, jnp.int32(8), None, 1)
+    current, ends = workers.start(space, assignment, jax.random.key(0)), []
+    for step in range(2 * space.horizon):
+        action, key = jnp.zeros((1, 1), jnp.int32), jax.random.key(1 + step)
+        current, transition, _, episode, done = workers.step(space, current, action, assignment, jnp.int32(step), key)
+        assert not transition.terminated.any()
+        assert (transition.done == done).all()
+        ends += [int(episode.length[0, 0])] * bool(done[0, 0])
+    assert ends == [space.horizon] * 2
 
 
 def test_an_episode_is_a_success_if_any_of_its_steps_is():
@@ -290,9 +361,16 @@ def test_lanes_without_a_key_target_or_hparams_of_their_own_are_refused():
         jax.random.split(jax.random.key(0), 2),
         stack_hparams([HParams()] * 2),
     )
-    for given in ((keys[:1], targets(2), lanes), (keys, targets(1), lanes), (keys, targets(2), stack_hparams([HParams()]))):
-        with pytest.raises(ValueError, match=r"a program of 2 lanes needs arrays \[2, ...\], got one of shape"):
-            compiled.init(*given)
+    in_turns = make_program(make_trainer(SPACE, config("dqn")), 2, resident=1, devices=jax.devices()[:1])
+    for given in (
+        (keys[:1], targets(2), lanes),
+        (keys, targets(1), lanes),
+        (keys, targets(3), lanes),
+        (keys, targets(2), stack_hparams([HParams()])),
+    ):
+        for init in (compiled.init, in_turns.init, in_turns.init.lower):
+            with pytest.raises(ValueError, match=r"a program of 2 lanes needs arrays \[2, ...\], got one of shape"):
+                init(*given)
 
 
 def test_diversity_sees_a_collapse_of_one_modality():
