@@ -50,15 +50,16 @@ def cells(first: Sequence[Path], second: Sequence[Path], env_steps: int | None =
     """One line of the table.
 
     Raises:
-      UsageError: a set without runs, or a run that has not come to `env_steps`.
+      UsageError: a set without runs, or a run that has not come to `env_steps` with a seed unsolved.
     """
     if not first or not second:
         raise UsageError("--first and --second need at least one directory each")
     sets = [report.read(paths) for paths in (first, second)]
     made = {name: int(steps[-1]) for runs in sets for name, (steps, _) in runs.items()}
     until = min(made.values()) if env_steps is None else env_steps
-    if short := [f"{name} ({steps:,})" for name, steps in made.items() if steps < until]:
-        raise UsageError(f"--env-steps {until} must be at most what every run has made: {', '.join(short)}")
+    for name, run in {**sets[0], **sets[1]}.items():
+        if made[name] < until and np.isinf(solving_times([run], until)).any():
+            raise UsageError(f"--env-steps {until} is more than {name} has made with a seed unsolved: {made[name]}")
     times = [solving_times(list(runs.values()), until) for runs in sets]
     solved = " and ".join(f"{np.isfinite(own).sum()} of {own.size}" for own in times)
     names = [", ".join(runs) for runs in sets]

@@ -52,11 +52,16 @@ def test_what_comes_later_or_never_does_not_count():
     np.testing.assert_array_equal(contrast.solving_times([(steps, curves)] * 2, until=3_000), [2_000, 3_000, NEVER] * 2)
 
 
-def test_a_run_that_has_not_come_so_far_is_named():
+def test_a_run_that_was_stopped_with_a_seed_unsolved_is_named():
     first, second = RESULTS / "grid_world_B_return_only", RESULTS / "grid_world_B_dqn"
-    with pytest.raises(UsageError, match=r"70000 must be at most what every run has made: grid_world_B_return_only \(60,000\)"):
+    with pytest.raises(UsageError, match="70000 is more than grid_world_B_return_only has made with a seed unsolved: 60000"):
         contrast.cells([first], [second], 70_000)
     assert contrast.cells([first], [second])[2:4] == ("60,000", "4 of 5 and 0 of 5")
+
+
+def test_a_run_that_was_stopped_with_all_seeds_solved_has_come_far_enough():
+    solved, other = RESULTS / "grid_world_C_progress_only", RESULTS / "grid_world_C_dqn"
+    assert contrast.cells([solved], [other], 100_000)[2:4] == ("100,000", "5 of 5 and 2 of 5")
 
 
 def test_the_command_line_prints_the_table(monkeypatch, capsys):
