@@ -24,6 +24,7 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
     rounds = config.model_updates_per_step * steps
     longest = horizon * config.envs_per_source
     needed = config.recent_steps + longest
+    most = (2**31 - 1) // sources  # places in it are counted in 32 bits
 
     def require(holds: bool, message: str) -> None:
         if not holds:
@@ -73,9 +74,9 @@ def check_sizes(config: Config, sources: int, horizon: int, learns: bool) -> Non
         f"got {config.replay_episodes}",
     )
     require(
-        config.replay_steps >= needed and config.replay_steps % config.envs_per_source == 0,
+        needed <= config.replay_steps <= most and config.replay_steps % config.envs_per_source == 0,
         f"replay_steps must be a multiple of envs_per_source and hold recent_steps and one more horizon: at least {needed}, "
-        f"got {config.replay_steps}",
+        f"at most {most}, got {config.replay_steps}",
     )
 
 
@@ -108,10 +109,12 @@ def check_space(space: TaskSpace) -> None:
     ):
         if _struct(given) != _struct(expected):
             raise ValueError(f"{space.name}.{name} {expected}, got {given}")
-    reported = {"return", "success", "logit"} | {
-        f"{kind}_{name}" for kind in ("entropy", "spread") for name in space.param_spec
-    }
-    if taken := reported & set(jax.eval_shape(space.describe, task, task)):
+    described = jax.eval_shape(space.describe, task, task)
+    for name, value in described.items():
+        if value.shape:
+            raise ValueError(f"{space.name}.describe must return scalars, got {name} of shape {value.shape}")
+    measured = {f"{kind}_{name}" for kind in ("entropy", "spread") for name in space.param_spec}
+    if taken := {"return", "success", "logit", *measured} & set(described):
         raise ValueError(f"{space.name}.describe must leave these names to the trainer: {', '.join(sorted(taken))}")
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Key
 
 from apt_jax.replay import Episode, Transition
 from apt_jax.specs import Obs, Params, param_struct, zeros_like
-from apt_jax.task_space import TaskSpace, over_environments
+from apt_jax.task_space import StepOutput, TaskSpace, over_environments
 
 
 class Workers(NamedTuple):
@@ -87,9 +87,12 @@ def step(
       they would end with this step, and which of them did.
 
     Raises:
-      ValueError: while traced, if the space's step returns a state, observations, a reward or flags of another shape or dtype.
+      ValueError: while traced, if the space's step returns no `StepOutput`, or a state, observations, a reward or flags of
+        another shape or dtype.
     """
     out = over_environments(space.step)(workers.state, action, workers.task)
+    if not isinstance(out, StepOutput):
+        raise ValueError(f"{space.name}.step must return a StepOutput, got {type(out).__name__}")
     _check_like(out.state, workers.state, f"{space.name}.step must return a state like reset")
     _check_like(out.obs, workers.obs, f"{space.name}.step must return observations like reset")
     _check_like(out.reward, workers.episode_return, f"{space.name}.step must return a float32 reward")

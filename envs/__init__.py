@@ -66,8 +66,7 @@ def load_target_file(space_name: str, path: str | Path) -> Any:
       OSError: if the file cannot be read.
     """
     space = make(space_name)
-    text = Path(path).read_text(encoding="utf-8")
     try:
-        return space.parse_target(text)
+        return space.parse_target(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error

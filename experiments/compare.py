@@ -154,8 +154,11 @@ def plan(comparison: Compare, options: Sequence[str]) -> list[tuple[Experiment, 
 
 
 def _run(path: Path, words: Sequence[str]) -> tuple[Experiment, Session]:
-    resume = ["--resume"] if (path / "config.json").is_file() else []
-    return command_line.parse(["--run-dir", str(path), *resume, *words])
+    begun = (path / "config.json").is_file()
+    try:
+        return command_line.parse(["--run-dir", str(path), *["--resume"] * begun, *words])
+    except UsageError as error:
+        raise UsageError(f"{path}, begun earlier: {error}" if begun else str(error)) from error
 
 
 def run_path(comparison: Compare, method: str, target: str) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ import tyro
 from jaxtyping import Float
 from scipy import stats
 
-from experiments import markdown, plots, report
+from experiments import markdown, plots, report, run_dir
 from experiments.errors import UsageError, exit_with
 
 HEADER = ("first", "second", "to steps", "solved", "p (solved)", "p (sooner)")
@@ -41,7 +42,7 @@ class Contrast:
 
 def main() -> int:
     """The command line."""
-    contrast = tyro.cli(Contrast, prog="python -m experiments.contrast", description=__doc__)
+    contrast = tyro.cli(Contrast, prog="python -m experiments.contrast")
     print(markdown.table(HEADER, [cells(contrast.first, contrast.second, contrast.env_steps)]))
     return 0
 
@@ -50,20 +51,41 @@ def cells(first: Sequence[Path], second: Sequence[Path], env_steps: int | None =
     """One line of the table.
 
     Raises:
-      UsageError: a set without runs, or a run that has not come to `env_steps` with a seed unsolved.
+      UsageError: a set without runs, a sweep, a run twice, sets on different targets, or a run that has not come to `env_steps`
+        with a seed unsolved.
     """
     if not first or not second:
         raise UsageError("--first and --second need at least one directory each")
-    sets = [report.read(paths) for paths in (first, second)]
-    made = {name: int(steps[-1]) for runs in sets for name, (steps, _) in runs.items()}
-    until = min(made.values()) if env_steps is None else env_steps
-    for name, run in {**sets[0], **sets[1]}.items():
-        if made[name] < until and np.isinf(solving_times([run], until)).any():
-            raise UsageError(f"--env-steps {until} is more than {name} has made with a seed unsolved: {made[name]}")
-    times = [solving_times(list(runs.values()), until) for runs in sets]
+    if env_steps is not None and env_steps < 1:
+        raise UsageError(f"--env-steps must be at least 1, got {env_steps}")
+    paths = [*first, *second]
+    check_comparable(first, second)
+    runs = [run_dir.read_metrics(path) for path in paths]
+    until = min(int(steps[-1]) for steps, _ in runs) if env_steps is None else env_steps
+    for path, (steps, curves) in zip(paths, runs, strict=True):
+        if steps[-1] < until and np.isinf(solving_times([(steps, curves)], until)).any():
+            raise UsageError(f"--env-steps {until} is more than {path} has made with a seed unsolved: {steps[-1]}")
+    times = [solving_times(own, until) for own in (runs[: len(first)], runs[len(first) :])]
     solved = " and ".join(f"{np.isfinite(own).sum()} of {own.size}" for own in times)
-    names = [", ".join(runs) for runs in sets]
+    names = [", ".join(path.name for path in own) for own in (first, second)]
     return (*names, f"{until:,}", solved, f"{p_solved(*times):.2g}", f"{p_sooner(*times):.2g}")
+
+
+def check_comparable(first: Sequence[Path], second: Sequence[Path]) -> None:
+    """Raises a `UsageError` unless both sets are on the same targets, no run is there twice, and none is a sweep."""
+    targets = []
+    for paths in (first, second):
+        configs = [run_dir.read_config(path) for path in paths]
+        for path in paths:
+            if len(settings := run_dir.read_settings(path)) > 1:
+                raise UsageError(f"{path} is a sweep of {len(settings)} settings, which are no seeds")
+        seeds = [(json.dumps({**config, "seeds": seed, "env_steps": 0})) for config in configs for seed in config["seeds"]]
+        if len(set(seeds)) < len(seeds):
+            raise UsageError(f"the same seed of the same run is there twice: {', '.join(map(str, paths))}")
+        targets.append({(config["space"], config["target"]) for config in configs})
+    if targets[0] != targets[1]:
+        named = (", ".join(sorted(f"{target} of {space}" for space, target in own)) for own in targets)
+        raise UsageError(f"--first and --second need the same targets, got {' beside '.join(named)}")
 
 
 def solving_times(runs: Sequence[plots.Run], until: int) -> Float[np.ndarray, "S"]:

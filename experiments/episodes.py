@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, Key, UInt8
+from jaxtyping import Array, Int, Key
 
 import envs
 from apt_jax import evaluation
@@ -62,9 +62,6 @@ def play(
     return Episode([first, *after], [int(action) for action in actions[:steps]], bool(success[steps - 1]))
 
 
-def film(
-    space: envs.BenchmarkSpace, trainer: Trainer, policy: Any, task: Any, key: Key[Array, ""]
-) -> list[UInt8[np.ndarray, "H W 3"]]:
-    """Pictures of one greedy episode, from its first state to its last; consumes `key`."""
-    episode = play(space, task, lambda obs, _: trainer.act(policy, obs), key)
-    return [space.render(task, state) for state in episode.states]
+def greedy(space: envs.BenchmarkSpace, trainer: Trainer, policy: Any, task: Any, key: Key[Array, ""]) -> Episode:
+    """One episode of a trained policy; consumes `key`."""
+    return play(space, task, lambda obs, _: trainer.act(policy, obs), key)

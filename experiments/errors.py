@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 
@@ -11,9 +11,21 @@ class UsageError(Exception):
     """A request that cannot be fulfilled as given; the message says why and what would be."""
 
 
-def make_folder(file: Path | None) -> None:
-    """Makes the directory that `file` is to be written to, before the work; raises a `UsageError` if there cannot be one."""
+PICTURES = (".png", ".pdf", ".svg", ".jpg")
+"""Suffixes of the pictures that matplotlib writes."""
+
+
+def check_output(file: Path | None, suffixes: Sequence[str]) -> None:
+    """Makes the directory that `file` is to be written to, before the work.
+
+    Raises:
+      UsageError: there cannot be one, or the file is a directory, or its name ends otherwise than one of `suffixes`.
+    """
     if file:
+        if file.is_dir():
+            raise UsageError(f"{file} is a directory; name the file to write")
+        if file.suffix.lower() not in suffixes:
+            raise UsageError(f"{file} must end in {' or '.join(suffixes)}")
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:

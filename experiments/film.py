@@ -19,9 +19,9 @@ from envs.manipulation.solver import solve
 from envs.manipulation.targets import DEMONSTRATIONS
 from experiments import episodes, runtime
 from experiments.episodes import Episode
-from experiments.errors import UsageError, exit_with, make_folder
+from experiments.errors import UsageError, check_output, exit_with
 from experiments.problem import load_target
-from experiments.settings import make_space, target_path
+from experiments.settings import check_seed, make_space, target_path
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ def main() -> int:
 
 def film(args: Args) -> None:
     """Writes a film of a shortest solution: the known one of a named target, else one that is searched for."""
-    make_folder(args.out)
+    check_output(args.out, (".gif",))
+    check_seed(args.seed)
     try:
         space = Space()
     except ValueError as error:

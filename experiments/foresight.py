@@ -85,6 +85,7 @@ def main() -> int:
     """The command line."""
     args = tyro.cli(Args, prog="python -m experiments.foresight", description=__doc__)
     runtime.setup()
+    settings.check_seed(args.seed)
     for name in ("periods", "tasks"):
         if getattr(args, name) < 1:
             raise UsageError(f"--{name} must be at least 1, got {getattr(args, name)}")

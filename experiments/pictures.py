@@ -10,9 +10,8 @@ import jax
 import numpy as np
 
 import envs
-import envs.rendering
 from apt_jax.specs import Params
-from experiments import episodes, plots, run_dir
+from experiments import episodes, film, plots, run_dir
 from experiments.problem import Problem
 from experiments.settings import Experiment, target_name
 
@@ -87,5 +86,6 @@ def draw_policy(path: Path, experiment: Experiment, problem: Problem, policies: 
     _, curves = run_dir.read_metrics(path)
     best = int(np.argmax(curves["target_return"][:, -1]))
     policy = jax.tree.map(lambda x: x[best], policies)
-    frames = episodes.film(problem.space, problem.trainer, policy, problem.target, jax.random.key(experiment.lanes[best].seed))
-    envs.rendering.save_gif(path / "policy.gif", frames, problem.space.fps)
+    key = jax.random.key(experiment.lanes[best].seed)
+    episode = episodes.greedy(problem.space, problem.trainer, policy, problem.target, key)
+    film.save(path / "policy.gif", problem.space, problem.target, episode, robot=False)

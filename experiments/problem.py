@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 import envs
 from apt_jax.checks import check_target
 from apt_jax.config import Config, HParams
 from apt_jax.curricula.apt_gen import AptGenState
 from apt_jax.task_space import task_struct
-from apt_jax.trainer import Trainer, make_trainer
+from apt_jax.trainer import Clock, Trainer, make_trainer
 from experiments.errors import UsageError
 from experiments.settings import Experiment, make_space
 
@@ -55,15 +56,27 @@ def import_plugins(names: Iterable[str]) -> None:
 def make_problem(experiment: Experiment) -> Problem:
     """Imports plug-ins and checks every name and size before anything is compiled; raises a `UsageError`."""
     import_plugins(experiment.plugins)
-    target = load_target(experiment.space, experiment.target, experiment.target_file)
     space = make_space(experiment.space)
+    if experiment.target_file == Path(experiment.target) and experiment.target in space.targets:
+        raise UsageError(f"--target {experiment.target} is both a target of {space.name} and a file here; rename the file")
+    target = load_target(experiment.space, experiment.target, experiment.target_file)
     try:
         problem = Problem(space, target, make_trainer(space, experiment.config))
         check_target(space, target)
+        if experiment.plugins:
+            check_traces(problem.trainer)
     except ValueError as error:
         raise UsageError(str(error)) from error
     check_env_steps(experiment.env_steps, experiment.config)
     return problem
+
+
+def check_traces(trainer: Trainer) -> None:
+    """Raises what tracing the warm-up does, a `ValueError` where a task space's `step` is not as it should be."""
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    hparams = jax.tree.map(jnp.float32, HParams())
+    state = jax.eval_shape(trainer.init, key, task_struct(trainer.space), hparams)
+    jax.eval_shape(trainer.warmup, state, Clock.start(), hparams)
 
 
 def check_apt_gen(trainer: Trainer, run: Path) -> None:

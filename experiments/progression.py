@@ -10,7 +10,7 @@ from typing import Any
 import tyro
 
 from experiments import film, pictures, plots, run_dir, runtime, settings
-from experiments.errors import UsageError, exit_with, make_folder
+from experiments.errors import PICTURES, UsageError, check_output, exit_with
 from experiments.problem import import_plugins, load_target
 
 
@@ -43,10 +43,13 @@ def draw(args: Args) -> None:
     Raises:
       UsageError: no run, no tasks in it, no folder to write to, no robot in its space, or no OpenGL to draw it with.
     """
-    make_folder(args.out)
+    check_output(args.out, PICTURES)
     experiment = settings.load(args.run_dir)
     if not run_dir.task_files(args.run_dir):
-        raise UsageError(f"{args.run_dir} holds no generated tasks: its method generates none, or it has not begun to")
+        raise UsageError(
+            f"{args.run_dir} holds no generated tasks (tasks/*.npz): its method generates none, it has not begun to, or they "
+            "were left out"
+        )
     import_plugins(experiment.plugins)
     target = load_target(experiment.space, experiment.target, experiment.target_file)
     space = settings.make_space(experiment.space)

@@ -9,9 +9,9 @@ import jax
 import tyro
 
 from experiments import plots, runtime
-from experiments.errors import UsageError, exit_with, make_folder
+from experiments.errors import PICTURES, UsageError, check_output, exit_with
 from experiments.problem import import_plugins
-from experiments.settings import make_space
+from experiments.settings import check_seed, make_space
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,8 @@ def main() -> int:
     args = tyro.cli(Args, prog="python -m experiments.random_tasks")
     if min(args.rows, args.columns) < 1:
         raise UsageError(f"--rows and --columns must be at least 1, got {args.rows} and {args.columns}")
-    make_folder(args.out)
+    check_output(args.out, PICTURES)
+    check_seed(args.seed)
     runtime.setup()
     import_plugins(args.plugins)
     space = make_space(args.space)

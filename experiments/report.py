@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from experiments import markdown, plots, run_dir
 from experiments.aggregates import iqm, iqm_interval
-from experiments.errors import UsageError, exit_with, make_folder
+from experiments.errors import PICTURES, UsageError, check_output, exit_with
 
 SOLVED = 0.9
 """Target return from which a task counts as solved."""
@@ -51,7 +51,7 @@ def main() -> int:
     known = {metric for _, curves in runs.values() for metric in curves}
     if not report.metrics or not known.issuperset(report.metrics):
         raise UsageError(f"--metrics must be among {', '.join(sorted(known))}; got {', '.join(report.metrics) or 'none'}")
-    make_folder(report.figure)
+    check_output(report.figure, PICTURES)
     print(table(runs))
     if report.figure:
         plots.comparison(report.figure, {"": runs}, metrics=report.metrics)

@@ -6,6 +6,7 @@
 * checkpoints/: the latest state (orbax)
 * tasks/: generated task parameters over time, one npz per sampled step, leaves [lanes, tasks, ...], and a picture per lane
 * pictures
+* lock: held by the process that writes
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 from jaxtyping import Float, Int
 
 from apt_jax.specs import Params
@@ -35,23 +38,40 @@ class RunDir:
 
     def __init__(self, path: Path):
         self.path = path
+        self._lock = FileLock(path / "lock")
 
-    @classmethod
-    def create(cls, path: Path, config: Mapping[str, Any], target_file: Path | None) -> RunDir:
-        """A new run; `target_file` is copied in, so that the directory stands alone.
+    def create(self, config: Mapping[str, Any], target_file: Path | None) -> None:
+        """Begins a new run; `target_file` is copied in, so that the directory stands alone.
 
         Raises:
-          UsageError: the directory holds something already.
+          UsageError: the directory holds something already, or cannot be made.
         """
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise UsageError(f"{path} is not empty; pass --resume to go on with the run in it, or another --run-dir")
-        path.mkdir(parents=True, exist_ok=True)
+        if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+            raise UsageError(f"{self.path} is not empty; pass --resume to go on with the run in it, or another --run-dir")
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"--run-dir {self.path} cannot be made: {error}") from error
+        self.hold()
         if target_file:
-            shutil.copyfile(target_file, path / f"target{target_file.suffix}")
+            shutil.copyfile(target_file, self.path / f"target{target_file.suffix}")
             config = {**config, "target_file": f"target{target_file.suffix}"}
-        run = cls(path)
-        run.write_json("config.json", config)
-        return run
+        self.write_json("config.json", config)
+
+    def hold(self) -> None:
+        """Keeps other processes from writing to it until `release`, or the end of this one.
+
+        Raises:
+          UsageError: another one does.
+        """
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout as error:
+            raise UsageError(f"another process is at work on {self.path}; wait for it, or take another --run-dir") from error
+
+    def release(self) -> None:
+        """Lets others write to it."""
+        self._lock.release()
 
     @property
     def checkpoints(self) -> Path:
@@ -65,8 +85,9 @@ class RunDir:
 
     def rewind(self, env_steps: int) -> None:
         """Drops what was written after a checkpoint's step, so that a resumed run writes it once."""
-        rows = [row for row in _read_rows(self.path) if int(row["env_steps"]) <= env_steps]
         metrics = self.path / "metrics.csv"
+        with _naming(metrics):
+            rows = [row for row in _read_rows(self.path) if int(row["env_steps"]) <= env_steps]
         if rows:
             _write_rows(metrics.with_suffix(".tmp"), rows, mode="w")
             metrics.with_suffix(".tmp").replace(metrics)
@@ -121,12 +142,13 @@ def read_config(path: Path) -> dict[str, Any]:
     """The content of config.json.
 
     Raises:
-      UsageError: no run in that directory.
+      UsageError: no run in that directory, or a damaged file.
     """
     file = path / "config.json"
     if not file.is_file():
         raise UsageError(f"{path} holds no run (no config.json)")
-    content: dict[str, Any] = json.loads(file.read_text())
+    with _naming(file):
+        content: dict[str, Any] = json.loads(file.read_text())
     return content
 
 
@@ -134,17 +156,21 @@ def read_metrics(path: Path) -> tuple[Int[np.ndarray, "T"], Curves]:
     """The environment steps of every evaluation that is there for all lanes, and the metrics with the lanes' own columns.
 
     Raises:
-      UsageError: no such directory, or no evaluation in it yet.
+      UsageError: no such directory, no evaluation in it yet, or damaged metrics.
     """
     if not path.is_dir():
         raise UsageError(f"{path} is no directory")
     rows = _read_rows(path)
-    lanes = len({tuple(row[name] for name in _lane_columns(rows)) for row in rows})
-    rows = rows[: len(rows) - len(rows) % max(lanes, 1)]
-    if not rows:
-        raise UsageError(f"{path} holds no evaluation yet (no rows in metrics.csv)")
-    columns = {name: np.array([float(row[name]) for row in rows]).reshape(-1, lanes).T for name in rows[0]}
-    return columns.pop("env_steps")[0].astype(int), columns
+    with _naming(path / "metrics.csv"):
+        lanes = len({tuple(row[name] for name in _lane_columns(rows)) for row in rows})
+        rows = rows[: len(rows) - len(rows) % max(lanes, 1)]
+        if not rows:
+            raise UsageError(f"{path} holds no evaluation yet (no rows in metrics.csv)")
+        columns = {name: np.array([float(row[name]) for row in rows]).reshape(-1, lanes).T for name in rows[0]}
+    env_steps = columns.pop("env_steps")
+    if (env_steps != env_steps[0]).any() or (np.diff(env_steps[0]) <= 0).any():
+        raise UsageError(f"{path / 'metrics.csv'} is damaged: its rows are not one of each lane at each evaluation, in order")
+    return env_steps[0].astype(int), columns
 
 
 def read_settings(path: Path) -> dict[str, tuple[Int[np.ndarray, "T"], Curves]]:
@@ -154,6 +180,15 @@ def read_settings(path: Path) -> dict[str, tuple[Int[np.ndarray, "T"], Curves]]:
     names = [", ".join(f"{name} {curves[name][i, 0]:.10g}" for name in columns) for i in range(len(curves["seed"]))]
     lanes = {name: [i for i, other in enumerate(names) if other == name] for name in dict.fromkeys(names)}
     return {name: (env_steps, {metric: values[own] for metric, values in curves.items()}) for name, own in lanes.items()}
+
+
+@contextmanager
+def _naming(file: Path) -> Iterator[None]:
+    """Says which file it was where one cannot be read."""
+    try:
+        yield
+    except (ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{file} is damaged: {error}") from error
 
 
 def _lane_columns(rows: Sequence[Mapping[str, str]]) -> list[str]:

@@ -29,7 +29,7 @@ from apt_jax.networks import QNetwork
 from apt_jax.specs import Obs, Params
 from apt_jax.trainer import Trainer
 from experiments import markdown, runtime, settings
-from experiments.errors import UsageError, exit_with, make_folder
+from experiments.errors import PICTURES, UsageError, check_output, exit_with
 from experiments.ladder import Ladder, build
 from experiments.problem import check_apt_gen, make_problem
 from experiments.runner import load_lanes
@@ -76,7 +76,8 @@ class Judgement(NamedTuple):
 def main() -> int:
     """The command line."""
     args = tyro.cli(Args, prog="python -m experiments.rungs", description=__doc__)
-    make_folder(args.figure)
+    check_output(args.figure, PICTURES)
+    settings.check_seed(args.seed)
     runtime.setup()
     if args.tasks < 1:
         raise UsageError(f"--tasks must be at least 1, got {args.tasks}")

@@ -20,6 +20,9 @@ from experiments.presets import Preset
 
 SinkName = Literal["tensorboard", "wandb"]
 
+MOST_DEVICES = 1_024
+"""Of a host's CPU; so many take minutes to start."""
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -58,7 +61,8 @@ class Session:
 
     Attributes:
       run_dir: where everything is written; must be new, empty, or resumed.
-      resume: continue the run in the run directory; nothing else needs repeating.
+      resume: continue the run in the run directory; what it computes needs no repeating; layout, devices, sinks,
+        checkpoint_every and what says that there are several processes do.
       preset: where config and hparams start from: fast (the default) or paper; a resumed run keeps its own. The space's own
         discount comes on top and, with fast, what was tuned for the method. Other options override single fields.
       method: short for --config.method: apt_gen, apt_gen_progress_only, apt_gen_return_only, random, alp_gmm, goal_gan, dqn,
@@ -120,8 +124,8 @@ def check(experiment: Experiment, session: Session) -> None:
     """Raises a `UsageError` for what can be told wrong without the task space."""
     if not experiment.seeds or len(set(experiment.seeds)) != len(experiment.seeds):
         raise UsageError(f"--seeds needs one or more different numbers, got {' '.join(map(str, experiment.seeds)) or 'none'}")
-    if not 0 <= min(experiment.seeds) <= max(experiment.seeds) < 2**31:
-        raise UsageError(f"--seeds must lie in [0, 2^31), got {' '.join(map(str, experiment.seeds))}")
+    for seed in experiment.seeds:
+        check_seed(seed, "--seeds")
     if experiment.target_file and not experiment.target_file.is_file():
         raise UsageError(f"{experiment.target_file} is no file")
     for name, values in lanes.swept(experiment.hparams).items():
@@ -133,11 +137,17 @@ def check(experiment: Experiment, session: Session) -> None:
             check_hparams(lane.hparams)
         except ValueError as error:
             raise UsageError(f"--hparams: {error}") from error
-    for name in ("devices", "checkpoint_every"):
-        value = getattr(session, name)
-        if value is not None and value < 1:
-            raise UsageError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
+    if session.devices is not None and not 1 <= session.devices <= MOST_DEVICES:
+        raise UsageError(f"--devices must be from 1 to {MOST_DEVICES:,}, got {session.devices}")
+    if session.checkpoint_every < 1:
+        raise UsageError(f"--checkpoint-every must be at least 1, got {session.checkpoint_every}")
     check_processes(session)
+
+
+def check_seed(seed: int, option: str = "--seed") -> None:
+    """Raises a `UsageError` for what is no random seed."""
+    if not 0 <= seed < 2**31:
+        raise UsageError(f"{option} must lie in [0, 2^31), got {seed}")
 
 
 def check_processes(session: Session) -> None:

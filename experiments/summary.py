@@ -68,9 +68,11 @@ def summarise(path: Path, experiment: Experiment, times: Times) -> dict[str, obj
 
 
 def is_complete(path: Path, experiment: Experiment) -> bool:
-    """Whether a run directory has the results of all steps of an experiment; the summary is written last."""
-    file = path / "summary.json"
-    return file.exists() and int(json.loads(file.read_text())["env_steps"]) >= experiment.env_steps
+    """Whether a run directory has the results of all steps; the summary is written last, and anew if it is damaged."""
+    try:
+        return int(json.loads((path / "summary.json").read_text())["env_steps"]) >= experiment.env_steps
+    except (FileNotFoundError, ValueError, KeyError, TypeError):
+        return False
 
 
 def _number(value: np.floating) -> float | None:

@@ -30,6 +30,10 @@ from experiments.summary import Times, is_complete, summarise
 
 T = TypeVar("T")
 
+SAVING = "stopping after this chunk, then saving; once more to stop at once and lose what is not saved"
+NOTHING_TO_SAVE = "stopping once this is compiled; once more to stop at once, nothing is lost by that"
+"""Answers to an interrupt."""
+
 TASKS_PER_LANE = 8
 TASKS_EVERY = 5
 """Chunks between samples of generated tasks."""
@@ -61,13 +65,14 @@ def train(experiment: Experiment, session: Session) -> int:
         if processes.is_first():
             print(f"{run.path} has all its {experiment.env_steps:,} steps; pass a larger --env-steps to go on")
         return 0
-    start = processes.from_first(lambda: open_run(experiment, session))
     names = [lane.name for lane in experiment.lanes]
     with (
         Interrupt() as interrupt,
         make_view(names, experiment.env_steps) as view,
         ExitStack() as stack,
     ):
+        stack.callback(run.release)
+        start = processes.from_first(lambda: open_run(run, experiment, session))
         view.note(
             f"{experiment.config.method} on {experiment.space}, seeds {' '.join(map(str, experiment.seeds))}, into {run.path}"
         )
@@ -100,20 +105,25 @@ def open_sinks(experiment: Experiment, session: Session, start: int) -> list[Sin
     return make_sinks(names, session.run_dir, start=start, lanes=experiment.lanes, config=dataclasses.asdict(experiment))
 
 
-def open_run(experiment: Experiment, session: Session) -> int:
+def open_run(run: RunDir, experiment: Experiment, session: Session) -> int:
     """Makes a new run directory, or the one to resume as it was at its checkpoint; returns that one's steps, 0 without any.
 
     Raises:
-      UsageError: a new one holds something already, or one to resume has results but its checkpoint is gone.
+      UsageError: a new one holds something already; or one to resume is another process's, or has results but its checkpoint is
+        gone, or the other way round.
     """
     config = dataclasses.asdict(experiment)
     if not session.resume:
-        RunDir.create(session.run_dir, config, experiment.target_file)
+        run.create(config, experiment.target_file)
         return 0
-    run = RunDir(session.run_dir)
+    run.hold()
     start = checkpoint.latest_step(run.checkpoints) or 0
     if not start and run.has_results:
         raise UsageError(f"{run.path} has results, but no checkpoint to go on from (checkpoints/); take another --run-dir")
+    if start > experiment.config.warmup_steps and not run.has_results:
+        raise UsageError(
+            f"{run.path} has a checkpoint of {start:,} steps, but no results (metrics.csv); take another --run-dir"
+        )
     run.rewind(start)
     run.write_json("config.json", {**config, "target_file": run_dir.read_config(run.path)["target_file"]})
     return start
@@ -150,12 +160,12 @@ class Training:
 
     def _begin(self, start: int) -> None:
         self.view.note("compiling, or loading what an earlier start has compiled")
-        self.times.compile = self._patiently(self.runner.init)
+        self.times.compile = self._patiently(self.runner.init, NOTHING_TO_SAVE)
         if start:
             self.runner.restore(self.run_dir.checkpoints)
             self.view.note(f"restored {self.runner.env_steps:,} steps")
         if self._unfinished():
-            self.times.compile += self._patiently(self.runner.compile)
+            self.times.compile += self._patiently(self.runner.compile, NOTHING_TO_SAVE)
             self.view.note(f"{'compiled' if self.runner.programs.compiled else 'loaded'} in {self.times.compile:.1f} s")
         if self.runner.env_steps == 0 and self._unfinished():
             self._patiently(self.runner.warmup)
@@ -182,13 +192,14 @@ class Training:
             w = self.runner.propose(TASKS_PER_LANE)
             processes.from_first(lambda: self.run_dir.write_tasks(self.runner.env_steps, w))
 
-    def _patiently(self, work: Callable[[], T]) -> T:
+    def _patiently(self, work: Callable[[], T], answer: str = SAVING) -> T:
         """Does long work and stays able to answer an interrupt."""
-        return self.interrupt.run(work, on_request=self._acknowledge)
 
-    def _acknowledge(self) -> None:
-        self.view.stop()
-        self.view.note("stopping after this chunk, then saving; once more to stop at once and lose what is not saved")
+        def acknowledge() -> None:
+            self.view.stop()
+            self.view.note(answer)
+
+        return self.interrupt.run(work, on_request=acknowledge)
 
 
 if __name__ == "__main__":

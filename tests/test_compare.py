@@ -28,7 +28,7 @@ def test_a_plan_has_a_run_per_method_and_target_and_goes_on_with_what_is_there(t
         ("B", "dqn"),
     ]
     assert not any(session.resume for _, session in plan)
-    train.open_run(*plan[1])
+    train.open_run(RunDir(plan[1][1].run_dir), *plan[1])
     again = compare.plan(comparison, OPTIONS)
     assert [session.resume for _, session in again] == [False, True, False, False]
     assert [experiment for experiment, _ in again] == [experiment for experiment, _ in plan]
@@ -41,7 +41,7 @@ def test_seeds_are_split_over_jobs_and_put_together_again(tmp_path):
     runs = compare.plan(comparison, ["--preset", "fast", "--seeds", "4", "2", "9"])
     assert [experiment.seeds for experiment, _ in runs] == [(4, 2), (9,)]
     for experiment, session in runs:
-        train.open_run(experiment, session)
+        train.open_run(RunDir(session.run_dir), experiment, session)
         metrics = {name: np.float32(experiment.seeds) for name in ("target_return", "target_return_raw")}
         RunDir(session.run_dir).append_metrics(1_000, 0.5, [lane.index for lane in experiment.lanes], metrics)
     parts = compare.run_parts(comparison, "dqn", "A")
@@ -89,7 +89,8 @@ def test_a_summary_has_a_row_per_method_and_setting(tmp_path):
     for method, value in (("dqn", 0.25), ("rnd", 0.95)):
         path = compare.run_path(comparison, method, "A")
         path.parent.mkdir(parents=True, exist_ok=True)
-        run = RunDir.create(path, {}, None)
+        run = RunDir(path)
+        run.create({}, None)
         lanes = [{"seed": seed, "delta": delta} for delta in (0.1, 0.3) for seed in (0, 1)]
         metrics = {name: np.full(4, value, np.float32) for name in ("target_return", "target_return_raw")}
         run.append_metrics(1_000, 0.5, lanes, metrics)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from itertools import combinations
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 from experiments import contrast, document
 from experiments.errors import UsageError
+from experiments.run_dir import RunDir
 
 RESULTS = Path(__file__).parents[1] / "experiments/results"
 NEVER = np.inf
@@ -54,7 +56,7 @@ def test_what_comes_later_or_never_does_not_count():
 
 def test_a_run_that_was_stopped_with_a_seed_unsolved_is_named():
     first, second = RESULTS / "grid_world_B_return_only", RESULTS / "grid_world_B_dqn"
-    with pytest.raises(UsageError, match="70000 is more than grid_world_B_return_only has made with a seed unsolved: 60000"):
+    with pytest.raises(UsageError, match=r"70000 is more than .*grid_world_B_return_only has made with a seed unsolved: 60000"):
         contrast.cells([first], [second], 70_000)
     assert contrast.cells([first], [second])[2:4] == ("60,000", "4 of 5 and 0 of 5")
 
@@ -62,6 +64,48 @@ def test_a_run_that_was_stopped_with_a_seed_unsolved_is_named():
 def test_a_run_that_was_stopped_with_all_seeds_solved_has_come_far_enough():
     solved, other = RESULTS / "grid_world_C_progress_only", RESULTS / "grid_world_C_dqn"
     assert contrast.cells([solved], [other], 100_000)[2:4] == ("100,000", "5 of 5 and 2 of 5")
+
+
+def copy(run, to, **changes):
+    """A run directory under another name, with a changed configuration."""
+    to.mkdir(parents=True)
+    (to / "metrics.csv").write_bytes((run / "metrics.csv").read_bytes())
+    config = json.loads((run / "config.json").read_text())
+    (to / "config.json").write_text(json.dumps(config | changes))
+    return to
+
+
+def test_runs_of_one_name_are_told_apart(tmp_path):
+    """As `experiments.compare` names them: by their method, in a folder of the target's."""
+    first = copy(RESULTS / "grid_world_B_apt_gen_20", tmp_path / "one" / "run")
+    second = copy(RESULTS / "grid_world_B_random_20", tmp_path / "other" / "run")
+    assert contrast.cells([first], [second], 100_000)[:4] == ("run", "run", "100,000", "3 of 5 and 0 of 5")
+    with pytest.raises(UsageError, match=r"120000 is more than .*other/run has made"):
+        contrast.cells([first], [second], 120_000)
+
+
+def test_what_cannot_be_compared_is_refused(tmp_path):
+    run, other = RESULTS / "grid_world_B_apt_gen_20", RESULTS / "grid_world_B_random_20"
+    twice = copy(run, tmp_path / "copy", env_steps=100_000)
+    on_c = RESULTS / "grid_world_C_random_20"
+    for first, second, message in (
+        ([run, twice], [other], "the same seed of the same run is there twice"),
+        ([run], [on_c], "the same targets, got B of grid_world beside C of grid_world"),
+        ([], [other], "at least one directory each"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            contrast.cells(first, second)
+    with pytest.raises(UsageError, match="--env-steps must be at least 1, got -5"):
+        contrast.cells([run], [other], -5)
+
+
+def test_a_sweep_is_refused(tmp_path):
+    run = RunDir(tmp_path / "sweep")
+    run.create({"space": "grid_world", "target": "B", "seeds": [0]}, None)
+    lanes = [{"seed": 0, "gamma": gamma} for gamma in (0.9, 0.99)]
+    run.append_metrics(1_000, 0.0, lanes, {"target_return_raw": np.zeros(2)})
+    with pytest.raises(UsageError, match="sweep is a sweep of 2 settings"):
+        contrast.cells([run.path], [RESULTS / "grid_world_B_random_20"])
 
 
 def test_the_command_line_prints_the_table(monkeypatch, capsys):

@@ -15,6 +15,7 @@ from apt_jax.trainer import Clock, make_trainer
 from experiments import command_line, foresight, train
 from experiments.errors import UsageError
 from experiments.examples.corridor import Corridor
+from experiments.run_dir import RunDir
 
 
 def test_episodes_count_if_any_length_would_have_fitted():
@@ -89,7 +90,7 @@ def test_periods_weigh_by_the_tasks_played():
 
 def test_only_apt_gen_has_v2(tmp_path, monkeypatch):
     experiment, session = command_line.parse(["--run-dir", str(tmp_path), "--method", "random"])
-    train.open_run(experiment, session)
+    train.open_run(RunDir(session.run_dir), experiment, session)
     monkeypatch.setattr("sys.argv", ["foresight", "--run-dir", str(tmp_path)])
     monkeypatch.setattr("experiments.runtime.setup", lambda: None)
     with pytest.raises(UsageError, match="is no run of apt_gen but of random"):

@@ -18,6 +18,7 @@ from envs.grid_world.solver import solve
 from experiments import command_line, ladder, settings, train
 from experiments.examples.corridor import Corridor
 from experiments.problem import make_problem
+from experiments.run_dir import RunDir
 
 SPACE = envs.make("grid_world")
 PLUGIN = "experiments.ladder_methods"
@@ -47,7 +48,7 @@ def test_a_plug_in_adds_its_methods_to_a_run_and_is_remembered_by_it(tmp_path, m
     options = ["--plugins", PLUGIN, "--method", "ladder_C", "--target", "C"]
     experiment, session = command_line.parse(["--run-dir", str(tmp_path), *options])
     make_problem(experiment)
-    train.open_run(experiment, session)
+    train.open_run(RunDir(session.run_dir), experiment, session)
     assert settings.load(tmp_path) == experiment
     assert command_line.parse(["--run-dir", str(tmp_path), "--resume"])[0].plugins == (PLUGIN,)
 

@@ -17,6 +17,7 @@ from apt_jax.trainer import make_trainer
 from experiments import command_line, rungs, train
 from experiments.errors import UsageError
 from experiments.ladder import build
+from experiments.run_dir import RunDir
 
 LADDER = build(envs.load_target("grid_world", "A"))
 
@@ -65,7 +66,7 @@ def test_models_of_every_lane_judge_every_task():
 
 def test_only_apt_gen_has_what_is_asked_about(tmp_path, monkeypatch):
     experiment, session = command_line.parse(["--run-dir", str(tmp_path), "--method", "random"])
-    train.open_run(experiment, session)
+    train.open_run(RunDir(session.run_dir), experiment, session)
     monkeypatch.setattr("sys.argv", ["rungs", "--run-dir", str(tmp_path)])
     monkeypatch.setattr("experiments.runtime.setup", lambda: None)
     with pytest.raises(UsageError, match="is no run of apt_gen but of random"):

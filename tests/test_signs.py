@@ -10,7 +10,7 @@ import pytest
 
 from apt_jax.config import HParams
 from experiments import report, run_dir, signs
-from experiments.errors import UsageError, make_folder
+from experiments.errors import PICTURES, UsageError, check_output
 
 ROOT = Path(__file__).parents[1]
 
@@ -64,10 +64,16 @@ def test_no_run_is_a_mistake(module, monkeypatch):
         module.main()
 
 
-def test_folders_are_made_and_what_cannot_be_one_is_told(tmp_path):
-    make_folder(None)
-    make_folder(tmp_path / "new" / "deep" / "picture.png")
+def test_folders_are_made_and_where_nothing_can_be_written_is_told(tmp_path):
+    check_output(None, PICTURES)
+    check_output(tmp_path / "new" / "deep" / "picture.png", PICTURES)
     assert (tmp_path / "new" / "deep").is_dir()
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="file is no directory"):
-        make_folder(tmp_path / "file" / "picture.png")
+    for name, message in (
+        ("file/picture.png", "file is no directory"),
+        ("new", "new is a directory; name the file to write"),
+        ("film.mp4", "film.mp4 must end in .png or .pdf"),
+        ("film", "film must end in"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            check_output(tmp_path / name, PICTURES)

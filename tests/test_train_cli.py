@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 import envs
+from apt_jax import checkpoint
 from apt_jax.config import PRESETS, Config, HParams
 from apt_jax.methods import METHODS
 from experiments import command_line, evaluate, presets, run_dir, settings, sinks, train
@@ -27,6 +28,7 @@ from experiments.errors import UsageError
 from experiments.problem import load_target, make_problem
 from experiments.run_dir import RunDir
 from experiments.settings import Experiment, Session
+from experiments.summary import is_complete
 
 ROOT = Path(__file__).parents[1]
 
@@ -40,7 +42,7 @@ TINY = shlex.split(
 def start_run(path: Path, *options: str) -> Experiment:
     """A run directory as the script leaves it before its first chunk."""
     experiment, session = command_line.parse(["--run-dir", str(path), *options])
-    train.open_run(experiment, session)
+    train.open_run(RunDir(session.run_dir), experiment, session)
     return experiment
 
 
@@ -49,16 +51,18 @@ def start_run(path: Path, *options: str) -> Experiment:
     [
         ("--seeds 1 2 1", "--seeds needs .* different .* got 1 2 1"),
         ("--seeds -1", "--seeds must lie in .* got -1"),
-        ("--seeds 0 4294967296", "--seeds must lie in .* got 0 4294967296"),
+        ("--seeds 0 4294967296", "--seeds must lie in .* got 4294967296"),
         ("--hparams.delta 0.1 0.1", "--hparams.delta needs .* different numbers, got 0.1 0.1"),
         ("--hparams.delta nan", "delta must be finite, got nan"),
         ("--hparams.gamma 0.9 1.5", "gamma must be in .* got 1.5"),
         ("--method apt_gen+rdn", "closest is 'rnd'"),
-        ("--devices 0", "--devices must be at least 1"),
+        ("--devices 0", "--devices must be from 1 to 1,024, got 0"),
         ("--num-processes 2", "--num-processes and --process-id need --distributed"),
         ("--distributed --coordinator-address node1", "must be a host and a port as in node1:1234, got node1"),
         ("--distributed --num-processes 2 --process-id 2", "--process-id must be from 0 to .* got 2 of 2"),
         ("--checkpoint-every 0", "--checkpoint-every must be at least 1"),
+        ("--devices 100000", "--devices must be from 1 to 1,024, got 100000"),
+        ("--config.replay-steps 10000000000", "replay_steps must be .* at most 1073741823, got 10000000000"),
         ("--target missing.txt", "missing.txt is no file"),
         ("--env-steps 10000", r"warmup_steps \(10000\) .* is 11000"),
         ("--env-steps 2147484000", r"--env-steps must be below 2\^31, got 2147484000"),
@@ -152,6 +156,37 @@ def test_a_file_does_not_hide_a_target_of_its_name(tmp_path, monkeypatch):
     assert settings.target_path("grid_world", "yours") is None
 
 
+def test_a_file_named_like_a_target_of_a_plug_in_is_refused(tmp_path, monkeypatch):
+    """Until the plug-in is imported, nobody knows that there is such a target."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(envs, "SPACES", {name: space for name, space in envs.SPACES.items() if name != "corridor"})
+    monkeypatch.delitem(sys.modules, "experiments.examples.corridor", raising=False)
+    Path("far").write_text("3")
+    options = "--plugins experiments.examples.corridor --space corridor --run-dir run --target"
+    experiment, _ = command_line.parse([*options.split(), "far"])
+    with pytest.raises(UsageError, match="--target far is both a target of corridor and a file here"):
+        make_problem(experiment)
+    Path("far").rename("other")
+    assert command_line.parse([*options.split(), "other"])[0].target_file == Path("other")
+
+
+def test_a_step_of_a_plug_in_is_checked_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(envs, "SPACES", dict(envs.SPACES))
+    (tmp_path / "owing.py").write_text(
+        "import envs\nfrom experiments.examples.corridor import Corridor\n"
+        "class Owing(Corridor):\n"
+        "    name = 'owing'\n"
+        "    def step(self, state, action, task):\n"
+        "        return tuple(super().step(state, action, task))\n"
+        "envs.SPACES['owing'] = Owing\n"
+    )
+    options = "--plugins owing --space owing --target far --method dqn --config.warmup-steps 100 --env-steps 1100"
+    experiment, _ = command_line.parse(["--run-dir", str(tmp_path / "run"), *options.split()])
+    with pytest.raises(UsageError, match=r"owing.step must return a StepOutput, got tuple"):
+        make_problem(experiment)
+
+
 def test_help_names_every_space_and_method():
     text = f"{settings.Experiment.__doc__} {settings.Session.__doc__}"
     assert all(name in text for name in (*envs.SPACES, *METHODS))
@@ -182,7 +217,8 @@ def test_several_values_are_a_sweep_over_every_seed(tmp_path):
 
 
 def test_rows_with_other_columns_are_refused_and_what_is_there_stays(tmp_path):
-    run = RunDir.create(tmp_path / "run", {}, None)
+    run = RunDir(tmp_path / "run")
+    run.create({}, None)
     run.append_metrics(100, 0.5, [{"seed": 0}], {"target_return": np.float32([1])})
     before = (run.path / "metrics.csv").read_text()
     with pytest.raises(UsageError, match=r"other columns \(beta\)"):
@@ -191,7 +227,8 @@ def test_rows_with_other_columns_are_refused_and_what_is_there_stays(tmp_path):
 
 
 def test_rows_of_a_sweep_are_told_apart_by_their_columns(tmp_path):
-    run = RunDir.create(tmp_path / "run", {}, None)
+    run = RunDir(tmp_path / "run")
+    run.create({}, None)
     lanes = [lane.index for lane in Experiment(seeds=(4, 2), hparams=HParams(delta=(0.1, 0.3))).lanes]
     for step in (100, 200):
         run.append_metrics(step, 0.5, lanes, {"target_return": np.float32([1, 2, 3, 4]) * step})
@@ -279,7 +316,8 @@ def test_the_resume_command_repeats_how_not_what(tmp_path):
 
 @pytest.mark.parametrize("kept", range(1, 60, 7))
 def test_metrics_cut_off_anywhere_are_read_up_to_the_last_evaluation_of_all_seeds(tmp_path, kept):
-    run = RunDir.create(tmp_path / "run", {}, None)
+    run = RunDir(tmp_path / "run")
+    run.create({}, None)
     with pytest.raises(UsageError, match="no evaluation yet"):
         run_dir.read_metrics(run.path)
     for step in (100, 200):
@@ -292,8 +330,46 @@ def test_metrics_cut_off_anywhere_are_read_up_to_the_last_evaluation_of_all_seed
     np.testing.assert_array_equal(curves["target_return"], [[0.25], [-0.25]])
 
 
+def test_one_process_at_a_time_writes_to_a_run(tmp_path):
+    experiment, session = command_line.parse(["--run-dir", str(tmp_path / "run")])
+    first = RunDir(session.run_dir)
+    train.open_run(first, experiment, session)
+    again = command_line.parse(["--run-dir", str(tmp_path / "run"), "--resume"])
+    with pytest.raises(UsageError, match="another process is at work on"):
+        train.open_run(RunDir(session.run_dir), *again)
+    first.release()
+    assert train.open_run(RunDir(session.run_dir), *again) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("config.json", '{"space": ', "config.json is damaged"),
+        ("metrics.csv", "seed,env_steps,target_return\n0,100,abc0.0\n", "metrics.csv is damaged: could not convert"),
+        ("metrics.csv", "0,100,0.5\n0,200,0.5\n", "metrics.csv is damaged: 'env_steps' is not in list"),
+        ("metrics.csv", "seed,env_steps,target_return\n0,200,0.5\n0,200,0.5\n", "metrics.csv is damaged: its rows"),
+        ("metrics.csv", "seed,env_steps,target_return\n0,100,0.5\n1,200,0.5\n", "metrics.csv is damaged: its rows"),
+    ],
+)
+def test_a_damaged_file_is_named(tmp_path, name, content, message):
+    start_run(tmp_path / "run")
+    (tmp_path / "run" / name).write_text(content)
+    with pytest.raises(UsageError, match=message):
+        run_dir.read_metrics(tmp_path / "run") if name == "metrics.csv" else settings.load(tmp_path / "run")
+
+
+def test_a_damaged_summary_is_written_anew(tmp_path):
+    experiment = start_run(tmp_path / "run")
+    assert not is_complete(tmp_path / "run", experiment)
+    (tmp_path / "run" / "summary.json").write_text('{"env_steps": 100000')
+    assert not is_complete(tmp_path / "run", experiment)
+    (tmp_path / "run" / "summary.json").write_text('{"env_steps": 100000}')
+    assert is_complete(tmp_path / "run", experiment)
+
+
 def test_rewinding_drops_what_came_after_the_checkpoint(tmp_path):
-    run = RunDir.create(tmp_path / "run", {}, None)
+    run = RunDir(tmp_path / "run")
+    run.create({}, None)
     for step in (100, 200, 300):
         run.append_metrics(step, step / 10, [{"seed": 4}, {"seed": 2}], {"target_return": np.float32([step, -step]) / 7})
         run.write_tasks(step, {"xy": np.zeros((2, 8, 3), np.float32)})
@@ -377,9 +453,17 @@ def test_an_interrupted_run_says_how_to_go_on_and_ends_complete(tmp_path, capsys
 
     assert train.train(*command_line.parse(["--run-dir", str(run), "--resume"])) == 0
     assert "has all its 1,200 steps" in capsys.readouterr().out
-    evaluate.evaluate(evaluate.Args(run, target="B", episodes=2, gif=tmp_path / "film.gif"))
+    evaluate.evaluate(evaluate.Args(run, target=("B",), episodes=2, gif=tmp_path / "film.gif"))
     assert "B after 1,200 steps" in capsys.readouterr().out
     assert (tmp_path / "film.gif").exists()
+    evaluate.evaluate(evaluate.Args(run, target=("B", "C"), episodes=2, csv=tmp_path / "scores.csv"))
+    assert re.search("B after 1,200 steps(.|\n)*C after 1,200 steps", capsys.readouterr().out)
+    with (tmp_path / "scores.csv").open() as stream:
+        scores = list(csv.DictReader(stream))
+    assert [(row["target"], row["lane"]) for row in scores] == [(t, f"seed {s}") for t in "BC" for s in (3, 0, 5)]
+    assert all(-1.0 <= float(row["episode_return"]) <= 1.0 <= float(row["length"]) <= 50.0 for row in scores)
+    with pytest.raises(UsageError, match="--gif films one --target, got B, C"):
+        evaluate.evaluate(evaluate.Args(run, target=("B", "C"), gif=tmp_path / "film.gif"))
 
     kept = (run / "metrics.csv").read_bytes()
     shutil.rmtree(run / "checkpoints")
@@ -389,6 +473,19 @@ def test_an_interrupted_run_says_how_to_go_on_and_ends_complete(tmp_path, capsys
         train.train(*command_line.parse(["--run-dir", str(run), "--resume", "--env-steps", "1300"]))
     assert (run / "metrics.csv").read_bytes() == kept
     assert len(run_dir.task_files(run)) > 0
+
+
+def test_results_that_are_gone_are_not_begun_anew(tmp_path, monkeypatch):
+    experiment, session = command_line.parse(["--run-dir", str(tmp_path / "run"), *TINY])
+    run = RunDir(session.run_dir)
+    train.open_run(run, experiment, session)
+    run.release()
+    again = command_line.parse(["--run-dir", str(tmp_path / "run"), "--resume"])
+    monkeypatch.setattr(checkpoint, "latest_step", lambda _: 200)
+    assert train.open_run(RunDir(session.run_dir), *again) == 200  # only the warm-up was saved
+    monkeypatch.setattr(checkpoint, "latest_step", lambda _: 300)
+    with pytest.raises(UsageError, match="a checkpoint of 300 steps, but no results"):
+        train.open_run(RunDir(session.run_dir), *again)
 
 
 def rows(path: Path) -> list[tuple[int, int]]:

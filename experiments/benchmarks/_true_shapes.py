@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
@@ -17,28 +18,40 @@ REST = 1e-3
 """Long enough for whatever leans to fall, and the speed (m/s and rad/s) below which nothing does."""
 
 
-def push(task: Task, can: int, direction: int) -> tuple[Float[np.ndarray, "2"], str]:
-    """(x, y) of the pushed can, and one of "", "fell", "hit"; there must be room for the tool."""
+def push_scene(task: Task, can: int, direction: int) -> mujoco.MjModel:
+    """The table with the tool behind a can."""
     ahead, cans = DIRECTIONS[direction].astype(float), np.asarray(task.cans, float)
     x, y = cans[can] + TOOL_START * ahead
-    xml = table_scene.table_xml(task, cans, (x, y, math.atan2(ahead[1], ahead[0])))
-    model = mujoco.MjModel.from_xml_string(xml)
-    data = mujoco.MjData(model)
-    tool, body = model.joint("tool"), model.body(f"can{can}").id
-    geom, free = model.geom(f"can{can}").id, model.joint(f"can{can}")
-    fatal = {i for i in range(model.ngeom) if model.geom(i).name.startswith(("obstacle", "can"))} - {geom}
-    for step in range(round(SECONDS / model.opt.timestep)):
-        phase = math.pi * min(step * model.opt.timestep / STROKE_SECONDS, 1.0)
+    return mujoco.MjModel.from_xml_string(table_scene.table_xml(task, cans, (x, y, math.atan2(ahead[1], ahead[0]))))
+
+
+def stroke(model: mujoco.MjModel, data: mujoco.MjData, seconds: float) -> Iterator[float]:
+    """Steps the scene, the tool on its way; yields the time at which each step began, in seconds."""
+    tool = model.joint("tool")
+    for step in range(round(seconds / model.opt.timestep)):
+        began = step * model.opt.timestep
+        phase = math.pi * min(began / STROKE_SECONDS, 1.0)
         half = (STROKE + GAP) / 2
         data.qpos[tool.qposadr] = half * (1 - math.cos(phase))
         data.qvel[tool.dofadr] = half * math.pi / STROKE_SECONDS * math.sin(phase)
         mujoco.mj_step(model, data)
+        yield began
+
+
+def push(task: Task, can: int, direction: int) -> tuple[Float[np.ndarray, "2"], str]:
+    """(x, y) of the pushed can, and one of "", "fell", "hit"; there must be room for the tool."""
+    model = push_scene(task, can, direction)
+    data = mujoco.MjData(model)
+    body = model.body(f"can{can}").id
+    geom, free = model.geom(f"can{can}").id, model.joint(f"can{can}")
+    fatal = {i for i in range(model.ngeom) if model.geom(i).name.startswith(("obstacle", "can"))} - {geom}
+    for seconds in stroke(model, data, SECONDS):
         place = data.xpos[body]
         if place[2] < CAN_HEIGHT / 2 - 0.02 or data.xmat[body][8] < 0.94:
             return place[:2].copy(), "fell"
         met = data.contact.geom[data.contact.dist <= 0]
         if fatal & set(met[(met == geom).any(axis=1)].ravel().tolist()):
             return place[:2].copy(), "hit"
-        if phase == math.pi and abs(data.qvel[free.dofadr[0] :][:6]).max() < REST:
+        if seconds >= STROKE_SECONDS and abs(data.qvel[free.dofadr[0] :][:6]).max() < REST:
             break
     return data.xpos[body][:2].copy(), ""

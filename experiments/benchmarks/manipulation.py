@@ -7,7 +7,6 @@ the true shapes of everything on the table.
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -22,10 +21,10 @@ import tyro
 from jaxtyping import Array, Bool, Float, Key
 
 import envs
-from envs.manipulation import scene, table_scene
-from envs.manipulation.push import GAP, STEPS, STROKE, STROKE_SECONDS, TOOL_START, possible, stroke
+from envs.manipulation import scene
+from envs.manipulation.push import STEPS, TOOL_START, possible, stroke
 from envs.manipulation.table import DIRECTIONS, Task
-from experiments.benchmarks import _measure
+from experiments.benchmarks import _measure, _true_shapes
 from experiments.benchmarks._measure import Options, Timing
 from experiments.errors import exit_with
 
@@ -152,33 +151,19 @@ def time_same_model(args: Args) -> Timing:
 def time_true_shapes(args: Args) -> Timing:
     """Cylinders, boxes and all blocks of random tables, each pushed once for as long as a push of ours lasts."""
     tasks, _, directions = jax.device_get(random_pushes(jax.random.key(0), args.true_pushes))
-    scenes = [_true_scene(jax.tree.map(lambda leaf, i=i: leaf[i], tasks), int(directions[i])) for i in range(args.true_pushes)]
+    scenes = [
+        _true_shapes.push_scene(jax.tree.map(lambda leaf, i=i: leaf[i], tasks), 0, int(directions[i]))
+        for i in range(args.true_pushes)
+    ]
 
     def run() -> float:
         began = time.perf_counter()
         for model in scenes:
-            _push_true(model)
+            for _ in _true_shapes.stroke(model, mujoco.MjData(model), STEPS * scene.TIMESTEP):
+                pass
         return (time.perf_counter() - began) / args.true_pushes
 
     return Timing(tuple(run() for _ in range(args.repeats)), 0.0)
-
-
-def _true_scene(task: Task, direction: int) -> mujoco.MjModel:
-    ahead = DIRECTIONS[direction].astype(float)
-    cans = np.asarray(task.cans, float)
-    x, y = cans[0] + TOOL_START * ahead
-    return mujoco.MjModel.from_xml_string(table_scene.table_xml(task, cans, (x, y, math.atan2(ahead[1], ahead[0]))))
-
-
-def _push_true(model: mujoco.MjModel) -> None:
-    data = mujoco.MjData(model)
-    tool = model.joint("tool")
-    for step in range(round(STEPS * scene.TIMESTEP / model.opt.timestep)):
-        phase = math.pi * min(step * model.opt.timestep / STROKE_SECONDS, 1.0)
-        half = (STROKE + GAP) / 2
-        data.qpos[tool.qposadr] = half * (1 - math.cos(phase))
-        data.qvel[tool.dofadr] = half * math.pi / STROKE_SECONDS * math.sin(phase)
-        mujoco.mj_step(model, data)
 
 
 def count_faults(space: str, pushes: int) -> int:
