@@ -66,6 +66,8 @@ class RunDir:
         """
         try:
             self._lock.acquire(timeout=0)
+        except NotImplementedError:  # a shared disk that knows no locks
+            return
         except Timeout as error:
             raise UsageError(f"another process is at work on {self.path}; wait for it, or take another --run-dir") from error
 

@@ -27,6 +27,7 @@ from experiments.benchmarks import __main__ as everything
 from experiments.benchmarks import (
     _flops,
     _measure,
+    capacity,
     dqn_peers,
     environments,
     growth,
@@ -207,6 +208,20 @@ def test_a_script_writes_its_numbers_and_what_they_need_to_be_read(tmp_path):
     assert "out" not in content["settings"]
     for timing in content["results"]["per_step"].values():
         assert math.isfinite(sum(timing["seconds"]))
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (capacity.Args(capacities=()), "--capacities must be at least 1, got none"),
+        (capacity.Args(chunk_steps=0), "--chunk-steps must be at least 1, got 0"),
+        (capacity.Args(capacities=(5, -1)), "--capacities must be at least 1, got 5 -1"),
+        (capacity.Args(repeats=0), "--repeats must be at least 1, got 0"),
+    ],
+)
+def test_sizes_below_one_are_usage_errors(args, message):
+    with pytest.raises(_measure.UsageError, match=message):
+        _measure.check(args)
 
 
 def test_a_wrong_number_of_cores_is_a_usage_error():

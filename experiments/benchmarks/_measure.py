@@ -112,8 +112,13 @@ def load_problem(preset: str, *, space: str = "grid_world", **changes: Any) -> P
 def check(options: Options) -> None:
     """To be called first: takes down the conditions; raises a `UsageError` for options that cannot be."""
     _at_start()
-    if options.repeats < 1:
-        raise UsageError(f"--repeats must be at least 1, got {options.repeats}")
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if not numbers or any(isinstance(number, int) and not isinstance(number, bool) and number < 1 for number in numbers):
+            raise UsageError(
+                f"--{field.name.replace('_', '-')} must be at least 1, got {' '.join(map(str, numbers)) or 'none'}"
+            )
 
 
 def pin(cores: int, *, first: int = 0) -> None:
