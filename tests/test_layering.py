@@ -17,8 +17,8 @@ ROOT = Path(__file__).resolve().parent.parent
 LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"descent", "draws", "registry", "specs"}),
     frozenset({"config", "task_space"}),
-    frozenset({"checks", "losses", "networks", "replay"}),
-    frozenset({"learner", "plugin"}),
+    frozenset({"losses", "networks", "replay"}),
+    frozenset({"checks", "learner", "plugin"}),
     frozenset({"bonuses", "curricula"}),
     frozenset({"evaluation", "methods", "workers"}),
     frozenset({"trainer"}),
