@@ -165,12 +165,17 @@ def make_program(
     return Program(init_all, warmup_all, chunk_all)
 
 
-def lane_bytes(trainer: Trainer) -> int:
-    """The size of one lane's state, most of it the replay."""
+def lane_struct(trainer: Trainer) -> TrainState:
+    """The shapes and dtypes of one lane's state."""
     hparams = jax.tree.map(np.float32, HParams())
     key = jax.eval_shape(lambda: jax.random.key(0))
-    state = jax.eval_shape(trainer.init, key, task_struct(trainer.space), hparams)
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+    state: TrainState = jax.eval_shape(trainer.init, key, task_struct(trainer.space), hparams)
+    return state
+
+
+def lane_bytes(trainer: Trainer) -> int:
+    """The size of one lane's state, most of it the replay."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(lane_struct(trainer)))
 
 
 def room(trainer: Trainer, memory: int) -> int:

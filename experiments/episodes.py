@@ -30,14 +30,18 @@ class Episode(NamedTuple):
     success: bool
 
 
-def score(trainer: Trainer, policies: Any, task: Any, *, episodes: int, key: Key[Array, ""]) -> evaluation.Outcome:
-    """Greedy episodes of every policy (leaves [L, ...]) on one task; leaves [L, episodes]; consumes `key`."""
-    tasks = jax.tree.map(lambda x: jnp.broadcast_to(x, (episodes, *jnp.shape(x))), task)
+def make_score(trainer: Trainer, episodes: int) -> Callable[[Any, Any, Key[Array, ""]], evaluation.Outcome]:
+    """`score(policies, task, key)`: greedy episodes of every policy (leaves [L, ...]) on one task; consumes `key`.
 
-    def play(params: Any) -> evaluation.Outcome:
+    Returns:
+      A function compiled once for all tasks, whose result has leaves [L, episodes].
+    """
+
+    def play(params: Any, task: Any, key: Key[Array, ""]) -> evaluation.Outcome:
+        tasks = jax.tree.map(lambda x: jnp.broadcast_to(x, (episodes, *jnp.shape(x))), task)
         return evaluation.play(trainer.space, tasks, lambda obs, _: trainer.act(params, obs), key)[0]
 
-    return jax.device_get(jax.jit(jax.vmap(play))(policies))
+    return jax.jit(jax.vmap(play, in_axes=(0, None, None)))
 
 
 def play(
@@ -57,7 +61,7 @@ def play(
         return state, jax.lax.scan(advance, (state, obs), jnp.arange(space.horizon))[1]
 
     first, (states, actions, over, success) = jax.device_get(rollout(key))
-    steps = int(np.argmax(over)) + 1
+    steps = int(np.argmax(over)) + 1 if over.any() else space.horizon
     after = [jax.tree.map(lambda x, i=i: x[i], states) for i in range(steps)]
     return Episode([first, *after], [int(action) for action in actions[:steps]], bool(success[steps - 1]))
 

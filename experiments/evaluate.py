@@ -75,15 +75,16 @@ def evaluate(args: Args) -> None:
     trainer = problems[0].trainer
     states, clock, _ = load_lanes(args.run_dir, experiment, trainer)
     policies = jax.device_put(states.policy, jax.local_devices()[0])
+    score = episodes.make_score(trainer, args.episodes)
     scores = []
     for other, problem in zip(experiments, problems, strict=True):
         key_score, key_film = jax.random.split(jax.random.key(args.seed))
-        outcome = episodes.score(trainer, policies, problem.target, episodes=args.episodes, key=key_score)
+        outcome = jax.device_get(score(policies, problem.target, key_score))
         own = lane_scores(settings.target_name(other), [lane.name for lane in experiment.lanes], outcome)
         _print(own, f"{own[0].target} after {int(clock.env_steps):,} steps")
         scores += own
         if args.gif:
-            best = int(np.argmax([score.episode_return for score in own]))
+            best = int(np.argmax([each.episode_return for each in own]))
             policy = jax.tree.map(lambda x: x[best], policies)  # noqa: B023
             episode = episodes.greedy(problem.space, trainer, policy, problem.target, key_film)
             film.save(args.gif, problem.space, problem.target, episode, robot=args.robot)

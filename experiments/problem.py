@@ -14,7 +14,7 @@ import envs
 from apt_jax.checks import check_target
 from apt_jax.config import Config, HParams
 from apt_jax.curricula.apt_gen import AptGenState
-from apt_jax.task_space import task_struct
+from apt_jax.lanes import lane_struct
 from apt_jax.trainer import Clock, Trainer, make_trainer
 from experiments.errors import UsageError
 from experiments.settings import Experiment, make_space
@@ -73,17 +73,12 @@ def make_problem(experiment: Experiment) -> Problem:
 
 def check_traces(trainer: Trainer) -> None:
     """Raises what tracing the warm-up does, a `ValueError` where a task space's `step` is not as it should be."""
-    key = jax.eval_shape(lambda: jax.random.key(0))
-    hparams = jax.tree.map(jnp.float32, HParams())
-    state = jax.eval_shape(trainer.init, key, task_struct(trainer.space), hparams)
-    jax.eval_shape(trainer.warmup, state, Clock.start(), hparams)
+    jax.eval_shape(trainer.warmup, lane_struct(trainer), Clock.start(), jax.tree.map(jnp.float32, HParams()))
 
 
 def check_apt_gen(trainer: Trainer, run: Path) -> None:
     """Raises a `UsageError` unless the curriculum of a run is APT-Gen's, which has models to be asked."""
-    key = jax.eval_shape(lambda: jax.random.key(0))
-    state = jax.eval_shape(trainer.init, key, task_struct(trainer.space), HParams())
-    if not isinstance(state.curriculum, AptGenState):
+    if not isinstance(lane_struct(trainer).curriculum, AptGenState):
         raise UsageError(f"{run} is no run of apt_gen but of {trainer.config.method}")
 
 

@@ -25,6 +25,7 @@ from apt_jax.methods import METHODS, Method, parse_method
 from apt_jax.specs import Grid, Vector
 from apt_jax.task_space import task_struct
 from apt_jax.trainer import Clock, make_trainer
+from experiments import episodes
 from experiments.examples.corridor import Corridor
 
 SPACE = Corridor()
@@ -311,6 +312,8 @@ def test_an_episode_is_truncated_at_the_horizon_by_a_space_that_forgets_to():
         assert (transition.done == done).all()
         ends += [int(episode.length[0, 0])] * bool(done[0, 0])
     assert ends == [space.horizon] * 2
+    episode = episodes.play(space, jnp.int32(8), lambda obs, step: jnp.int32(1), jax.random.key(0))
+    assert len(episode.actions) == len(episode.states) - 1 == space.horizon
 
 
 def test_an_episode_is_a_success_if_any_of_its_steps_is():
