@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -97,8 +98,10 @@ def make_objectives(
         return pooled(*judge(params, rollouts), rollouts.length)
 
     def evaluate(ensemble: Any, w: Params) -> Float[Array, "K n"]:
-        seen = as_instantiated(space.param_spec, w)
-        return jax.vmap(lambda member: apply(networks.value, member, seen))(ensemble)
+        size = jax.tree.leaves(ensemble)[0].shape[0]
+        # A copy each: gradients of networks that share their rows XLA for CPUs transposes number by number.
+        seen = jax.tree.map(lambda x: jnp.stack([x] * size), as_instantiated(space.param_spec, w))
+        return jax.vmap(partial(apply, networks.value))(ensemble, seen)
 
     def discriminator_loss(
         params: Any, spectral: Any, target: rp.Rollouts, generated: rp.Rollouts, hparams: HParams
