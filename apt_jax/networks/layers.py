@@ -41,7 +41,9 @@ def row_patches(x: Float[Array, "*batch h w c"], stride: int) -> Float[Array, "*
     *batch, height, width, channels = x.shape
     out, before, after = same_padding(height, stride)
     rows = x.reshape(*batch, height, width * channels)
-    rows = jnp.pad(rows, [(0, 0)] * len(batch) + [(before, after), (0, 0)])
+    # Not `jnp.pad`, which on CPU would be computed number by number and by itself; this is part of the slices.
+    zeros = jnp.zeros((*batch, max(before, after), width * channels), x.dtype)
+    rows = jnp.concatenate([zeros[..., :before, :], rows, zeros[..., :after, :]], axis=-2)
     last = stride * (out - 1) + 1
     return jnp.concatenate([rows[..., i : i + last : stride, :] for i in range(KERNEL_SIZE)], axis=-1)
 
