@@ -158,20 +158,11 @@ def make_program(
     def warmup_all(states: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock]:
         return warmup(states, clock, pad(hparams))
 
-    @partial(jax.jit, donate_argnums=0, compiler_options=chunk_options(used[0].platform))
+    @partial(jax.jit, donate_argnums=0)
     def chunk_all(states: TrainState, clock: Clock, hparams: HParams) -> tuple[TrainState, Clock, LaneMetrics]:
         return chunk(states, clock, pad(hparams))
 
     return Program(init_all, warmup_all, chunk_all)
-
-
-def chunk_options(platform: str) -> dict[str, str]:
-    """What XLA is told where a chunk is compiled for `platform`, as in `jax.jit(..., compiler_options=...)`.
-
-    On CPU, an order of operations by which little is held at a time: networks that are updated together are then computed one
-    after another, and find in the core's cache what they left there (experiments/NOTES.md, section 37).
-    """
-    return {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"} if platform == "cpu" else {}
 
 
 def lane_struct(trainer: Trainer) -> TrainState:

@@ -25,7 +25,6 @@ import numpy as np
 
 import envs
 from apt_jax.config import PRESETS, Config, HParams
-from apt_jax.lanes import chunk_options
 from experiments import markdown, runtime
 from experiments.errors import UsageError
 
@@ -139,11 +138,6 @@ def pin(cores: int, *, first: int = 0) -> None:
     os.sched_setaffinity(0, allowed[first : first + cores])
 
 
-def _jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Jitted as a chunk is; peers written in JAX too."""
-    return jax.jit(function, donate_argnums=0, compiler_options=chunk_options(jax.default_backend()))
-
-
 def time_loop(step: Callable[[C, F], C], carry: C, fixed: F, *, repeats: int, at_least: float) -> Timing:
     """Times `carry = step(carry, fixed)` in a compiled loop of as many runs as take `at_least` seconds.
 
@@ -155,7 +149,7 @@ def time_loop(step: Callable[[C, F], C], carry: C, fixed: F, *, repeats: int, at
         return jax.lax.fori_loop(0, length, lambda _, c: step(c, fixed), carry)
 
     carry = jax.tree.map(jnp.copy, carry)
-    compiled, compile_seconds = compile_ahead(_jit(loop), carry, fixed, np.int32(1))
+    compiled, compile_seconds = compile_ahead(jax.jit(loop, donate_argnums=0), carry, fixed, np.int32(1))
 
     def run(length: int) -> float:
         nonlocal carry
@@ -179,7 +173,7 @@ def time_calls(
       The times without the first call, which nothing is warm for, and the carry after all calls.
     """
     carry = jax.tree.map(jnp.copy, carry)
-    compiled, compile_seconds = compile_ahead(_jit(function), *carry, fixed)
+    compiled, compile_seconds = compile_ahead(jax.jit(function, donate_argnums=0), *carry, fixed)
     seconds, carry = time_runs(compiled, carry, fixed, repeats=repeats)
     return Timing(seconds, compile_seconds), carry
 
