@@ -99,7 +99,8 @@ def make_objectives(
 
     def evaluate(ensemble: Any, w: Params) -> Float[Array, "K n"]:
         size = jax.tree.leaves(ensemble)[0].shape[0]
-        # A copy each: gradients of networks that share their rows XLA for CPUs transposes number by number.
+        # A copy each: gradients of networks that share their rows XLA for CPUs transposes number by number.  Stacked, as the
+        # sum that is `jnp.broadcast_to`'s gradient would be merged with a product, which takes ten times as long.
         seen = jax.tree.map(lambda x: jnp.stack([x] * size), as_instantiated(space.param_spec, w))
         return jax.vmap(partial(apply, networks.value))(ensemble, seen)
 
